@@ -1,0 +1,55 @@
+"""Errors that say what to do next.
+
+Every error a user can meet derives from `PpdfError`; its message names the file or the value, the place, and the
+remedy. The command line turns them into one plain sentence and the exit code of the class.
+"""
+
+
+class PpdfError(Exception):
+    """Base of all errors raised on purpose by this package."""
+
+    exit_code = 1
+
+
+class ParameterError(PpdfError, ValueError):
+    """A parameter is outside its meaning; the message names it, its unit and the allowed range."""
+
+    exit_code = 2
+
+
+class SurveyError(PpdfError):
+    """The input tiles cannot be used as they are; the message names the file and the option that helps."""
+
+    exit_code = 2
+
+
+class TileError(SurveyError):
+    """One source file is unreadable, lies about itself or changed while it was in use."""
+
+
+class PlanError(PpdfError):
+    """The plan does not fit the memory, the disk or the raster limits; the message gives both numbers."""
+
+    exit_code = 2
+
+
+class StoreError(PpdfError):
+    """The run's store is missing, incomplete, torn or belongs to another run."""
+
+
+class ResumeError(StoreError):
+    """Inputs, parameters or versions differ from those of the existing run; the message shows old and new."""
+
+    exit_code = 2
+
+
+class PartialRunError(PpdfError):
+    """The run ended, but some chunks or tiles could not be done; they are listed by name."""
+
+    exit_code = 3
+
+
+class ClusterError(PpdfError):
+    """The scheduler or its workers cannot be used; the message says which check failed and where."""
+
+    exit_code = 4

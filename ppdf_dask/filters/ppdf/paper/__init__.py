@@ -1,0 +1,1 @@
+"""PPDF as published: the paper profile."""

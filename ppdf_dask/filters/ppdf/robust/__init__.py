@@ -1,0 +1,1 @@
+"""PPDF, robust profile: the default."""
