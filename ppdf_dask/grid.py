@@ -2,7 +2,7 @@
 
 Every length inside the package is an integer number of millimetres on **one grid for all jobs, anchored at absolute
 zero**. A coordinate is rounded to that grid once, when a point is decoded; from then on all arithmetic is exact, so two
-files with different scales and offsets agree to the last bit and nothing depends on where a survey was cut. (The written
+files with different scales and offsets agree to the last bit and nothing depends on where a survey was cut. (Written
 tiles keep their own integers: the grid serves the decision only.)
 """
 
@@ -63,9 +63,7 @@ class Rect:
 
     def union(self, other: Rect) -> Rect:
         """Return the bounding box of both."""
-        return Rect(
-            min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1)
-        )
+        return Rect(min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1))
 
     def metres(self) -> tuple[float, float, float, float]:
         """Return ``(x0, y0, x1, y1)`` in metres."""

@@ -21,9 +21,7 @@ Returns = Literal["last", "all"]
 Mode = Literal["update", "refine", "reset"]
 
 
-def quantity(
-    default: Any, unit: str, *, low: float | None = None, high: float | None = None, doc: str = ""
-) -> Any:
+def quantity(default: Any, unit: str, *, low: float | None = None, high: float | None = None, doc: str = "") -> Any:
     """Declare a numeric field with its unit and its closed range.
 
     Parameters
@@ -61,6 +59,9 @@ def quantity(
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
     """Base of every parameter object: validates itself, compares by value, has a fingerprint."""
+
+    RETURNS: ClassVar[Returns] = "last"
+    """For a filter's parameters: the returns it is offered unless the user says otherwise."""
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
@@ -109,9 +110,7 @@ class Parameters:
         given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k != "kind"}
         for name in given:
             if name not in known:
-                raise ParameterError(
-                    f"{cls.__name__} has no parameter {name!r}; it has {', '.join(sorted(known))}"
-                )
+                raise ParameterError(f"{cls.__name__} has no parameter {name!r}; it has {', '.join(sorted(known))}")
         return cls(**given)
 
 
@@ -167,12 +166,8 @@ class ClassRules(Parameters):
         super().__post_init__()
         if self.returns not in (None, "last", "all"):
             raise ParameterError(f"returns = {self.returns!r} is unknown; choose 'last' or 'all'")
-        if self.from_classes is not None and not all(
-            isinstance(c, int) and 0 <= c <= 255 for c in self.from_classes
-        ):
-            raise ParameterError(
-                f"from_classes = {self.from_classes!r} must be ASPRS classes between 0 and 255"
-            )
+        if self.from_classes is not None and any(c < 0 or c > 255 for c in self.from_classes):
+            raise ParameterError(f"from_classes = {self.from_classes!r} must be ASPRS classes between 0 and 255")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,7 +228,7 @@ class RunParams(Parameters):
     @property
     def returns(self) -> Returns:
         """The returns the filter sees: the rule's, or else the filter's own default."""
-        return self.classes.returns or getattr(self.filter, "RETURNS", "last")
+        return self.classes.returns or self.filter.RETURNS
 
 
 def _default_filter() -> Parameters:

@@ -37,7 +37,7 @@ class Filter:
     exact : bool
         True when the filter proves its answers (fills `Verdict.unproven`); then no seam can show.
     resolve : callable
-        ``resolve(params, density) -> Parameters``: replaces what is derived from the job-wide density by explicit numbers.
+        ``resolve(params, density) -> Parameters``: makes what is derived from the job-wide density explicit.
     bytes_per_point : float
         Peak memory per loaded point above the 12 bytes of the points themselves; for the planner.
     """
@@ -68,9 +68,7 @@ def get(name: str) -> Filter:
         if entry.name == name:
             found = entry.load()
             if not isinstance(found, Filter):
-                raise ParameterError(
-                    f"the entry point {entry.value!r} of filter {name!r} is not a ppdf_dask Filter"
-                )
+                raise ParameterError(f"the entry point {entry.value!r} of filter {name!r} is not a ppdf_dask Filter")
             return found
     raise ParameterError(f"there is no filter {name!r}; installed: {', '.join(names())}")
 

@@ -41,6 +41,7 @@ class Cloud:
     origin: tuple[int, int]
     n_core: int
     known: Rect | None = None
+    fixed: Bools | None = None
 
     @property
     def n(self) -> int:
