@@ -199,11 +199,22 @@ class DtmParams(Parameters):
     resolution : float
         Pixel size in metres; pixel edges lie at its multiples.
     max_edge : float
-        A triangle with a longer edge gives no height, so that lakes and the survey's outside stay NaN.
+        A triangle with a longer edge, or with an empty circle of a larger radius, gives no height, so that lakes and
+        the survey's outside stay NaN.
+    fill_edge : float or None
+        Also make a filled variant: the same surface with this larger limit instead of `max_edge`; None: no such thing.
     """
 
     resolution: float = quantity(1.0, "m", low=0.05, high=1000.0)
     max_edge: float = quantity(50.0, "m", low=0.1, high=10_000.0)
+    fill_edge: float | None = quantity(None, "m", low=0.1, high=10_000.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.fill_edge is not None and self.fill_edge < self.max_edge:
+            raise ParameterError(
+                f"fill_edge = {self.fill_edge} m is below max_edge = {self.max_edge} m; filling needs a larger limit"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
