@@ -45,14 +45,14 @@ class PcomParams(VoxelParams):
         A profile holds a layer and so many above and below; default 1 (completed), so that a gentle slope is not cut
         at a layer's boundary; 0 is the summary's single layer.
     interior : float
-        A kept centroid is dropped when it is more than this above the median of the kept ones within 3 voxels, in
-        voxels; default 1.5 (completed; the summary ties an "interior threshold" to the resolution).
+        A kept centroid is dropped when it is more than this above the median of the kept ones within 3 voxels, of
+        whatever layer, in voxels; default 1.5 (completed; the summary ties an "interior threshold" to the resolution).
     """
 
     min_area: float = quantity(1.0, "m2", low=0.0, high=1e6, doc="smallest cluster that is ground")
     min_voxels: int = quantity(3, "voxels", low=1, high=10**6, doc="smallest cluster at any level")
     tolerance: float = quantity(2.5, "voxels", low=1.0, high=10.0, doc="linking distance within a profile")
-    half_window: int = quantity(1, "layers", low=0, high=10, doc="layers above and below in one profile")
+    half_window: int = quantity(1, "layers", low=0, high=3, doc="layers above and below in one profile")
     interior: float = quantity(1.5, "voxels", low=0.1, high=100.0, doc="height over the neighbours that is dropped")
 
     def __post_init__(self) -> None:
@@ -235,6 +235,6 @@ FILTER = Filter(
     required_buffer=required_buffer,
     exact=False,
     resolve=_voxel.resolve,
-    bytes_per_point=200.0,
+    bytes_per_point=250.0,
 )
 """PCOM for the engine; ``literal`` clusters single layers, as the summary of the thesis says."""
