@@ -1,1 +1,42 @@
-"""PPDF: progressive plane detection filtering, after Cai, Liang and Yu (Forests 2023, 14(3), 498)."""
+"""PPDF: progressive plane detection filtering, after Cai, Liang and Yu (Forests 2023, 14(3), 498).
+
+Two profiles: `robust` (the default) works on real clouds, `paper` is the published method. Importing this package
+compiles nothing: the kernels are loaded with the first call.
+"""
+
+from __future__ import annotations
+
+from ppdf_dask.errors import ParameterError
+from ppdf_dask.filters import Filter
+from ppdf_dask.filters.cloud import Cloud, Density, Verdict
+from ppdf_dask.filters.ppdf.robust.params import RobustParams
+from ppdf_dask.params import Parameters
+
+
+def _classify(cloud: Cloud, params: Parameters) -> Verdict:
+    if isinstance(params, RobustParams):
+        from ppdf_dask.filters.ppdf.robust.classify import classify
+
+        return classify(cloud, params)
+    raise ParameterError(f"PPDF has no profile of type {type(params).__name__}")
+
+
+def _required_buffer(params: Parameters) -> float:
+    if isinstance(params, RobustParams):
+        return params.required_buffer()
+    raise ParameterError(f"PPDF has no profile of type {type(params).__name__}")
+
+
+def _resolve(params: Parameters, density: Density) -> Parameters:
+    return params.resolve(density) if isinstance(params, RobustParams) else params
+
+
+FILTER = Filter(
+    name="ppdf",
+    profiles={"robust": RobustParams()},
+    classify=_classify,
+    required_buffer=_required_buffer,
+    exact=True,
+    resolve=_resolve,
+    bytes_per_point=108.0,
+)

@@ -1,0 +1,188 @@
+"""The grid of cells over the loaded area: the lowest point of each cell, its state, low outliers (steps 1 and 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from ppdf_dask.filters.cloud import Cloud
+
+SQUARE = 16
+"""Cells along the edge of the largest plane square."""
+
+REF = np.uint8(1)
+UNPROVEN = np.uint8(2)
+LOW = np.uint8(4)
+DROPPED = np.uint8(8)
+MAYBE_DROPPED = np.uint8(16)
+FIXED = np.uint8(32)
+
+NO_FLOOR = np.int32(-(2**31))
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The padded grid of cells; a cell is addressed by ``row * width + column``."""
+
+    width: int
+    height: int
+    cell: int
+    x0: int
+    y0: int
+    of_point: npt.NDArray[np.int32]
+    pos: npt.NDArray[np.int32]
+    floor: npt.NDArray[np.int32]
+    state: npt.NDArray[np.uint8]
+
+
+@njit(nogil=True, cache=True)
+def _locate(x: Any, y: Any, x0: Any, y0: Any, cell: Any, width: Any, of_point: Any) -> None:
+    for i in range(len(x)):
+        of_point[i] = (y[i] - y0) // cell * width + (x[i] - x0) // cell
+
+
+@njit(nogil=True, cache=True)
+def _lowest(x: Any, y: Any, z: Any, fixed: Any, x0: Any, y0: Any, of_point: Any, pos: Any, state: Any) -> None:
+    for i in range(len(x)):
+        k = of_point[i]
+        s = state[k]
+        if s & UNPROVEN:
+            continue
+        pin = len(fixed) > 0 and fixed[i]
+        xi = x[i] - x0
+        yi = y[i] - y0
+        if s & LOW:
+            if s & FIXED and not pin:
+                continue
+            if pin == ((s & FIXED) != 0):
+                if z[i] > pos[k, 2]:
+                    continue
+                if z[i] == pos[k, 2] and (xi > pos[k, 0] or (xi == pos[k, 0] and yi >= pos[k, 1])):
+                    continue
+        pos[k, 0] = xi
+        pos[k, 1] = yi
+        pos[k, 2] = z[i]
+        state[k] = LOW | FIXED | REF if pin else LOW
+
+
+@njit(nogil=True, cache=True)
+def _flag_outliers(width: Any, pos: Any, floor: Any, state: Any, limit: Any, peel: Any, need: Any, again: Any) -> Any:
+    """Mark in `again` the cells whose low point goes (1) or cannot be judged (2); return how many go."""
+    low3 = np.empty(3, np.int64)
+    count = 0
+    for k in range(len(state)):
+        again[k] = 0
+        s = state[k]
+        if not s & LOW or s & FIXED:
+            continue
+        z = pos[k, 2]
+        n = 0
+        under = 0
+        unknown = False
+        low3[:] = 1 << 40
+        for dr in range(-2, 3):
+            base = k + dr * width
+            for j in range(base - 2, base + 3):
+                if j == k:
+                    continue
+                t = state[j]
+                if t & LOW:
+                    n += 1
+                    v = np.int64(pos[j, 2])
+                    if v < z + limit:
+                        under += 1
+                    if v < low3[2]:
+                        if v < low3[1]:
+                            low3[2] = low3[1]
+                            if v < low3[0]:
+                                low3[1] = low3[0]
+                                low3[0] = v
+                            else:
+                                low3[1] = v
+                        else:
+                            low3[2] = v
+                elif t & UNPROVEN:
+                    unknown = True
+            if under >= 3:
+                break
+        if under >= 3:
+            continue
+        if unknown:
+            again[k] = 2
+        elif n >= need:
+            again[k] = 1
+            floor[k] = min(low3[2] - limit, z + peel)
+            count += 1
+    return count
+
+
+@njit(nogil=True, cache=True)
+def _next_lowest(
+    x: Any, y: Any, z: Any, x0: Any, y0: Any, of_point: Any, pos: Any, floor: Any, state: Any, again: Any
+) -> None:
+    for k in range(len(state)):
+        if again[k] == 2:
+            state[k] = UNPROVEN
+        elif again[k] == 1:
+            state[k] = 0
+    for i in range(len(x)):
+        k = of_point[i]
+        if again[k] != 1 or z[i] <= floor[k]:
+            continue
+        xi = x[i] - x0
+        yi = y[i] - y0
+        if state[k] & LOW:
+            if z[i] > pos[k, 2]:
+                continue
+            if z[i] == pos[k, 2] and (xi > pos[k, 0] or (xi == pos[k, 0] and yi >= pos[k, 1])):
+                continue
+        pos[k, 0] = xi
+        pos[k, 1] = yi
+        pos[k, 2] = z[i]
+        state[k] = LOW
+
+
+def build(cloud: Cloud, cell: int, pad: int) -> Cells:
+    """Lay the grid over the cloud with a margin of `pad` cells and take the lowest point of each cell."""
+    ox, oy = cloud.origin
+    square = SQUARE * cell
+
+    def span(v: npt.NDArray[np.int32], o: int) -> tuple[int, int]:
+        low = ((int(v.min()) + o) // cell - pad) * cell // square * square
+        high = -(-((int(v.max()) + o) // cell + 1 + pad) * cell // square) * square
+        return low, (high - low) // cell
+
+    ax, width = span(cloud.x, ox)
+    ay, height = span(cloud.y, oy)
+    x0, y0 = ax - ox, ay - oy
+    n = width * height
+    of_point = np.empty(cloud.n, np.int32)
+    pos = np.zeros((n, 3), np.int32)
+    floor = np.full(n, NO_FLOOR, np.int32)
+    raster = np.zeros((height, width), np.uint8)
+    if cloud.known is not None:
+        k = cloud.known
+        c0, c1 = -(-(k.x0 - ax) // cell), (k.x1 - ax) // cell
+        r0, r1 = -(-(k.y0 - ay) // cell), (k.y1 - ay) // cell
+        inside = np.zeros((height, width), np.bool_)
+        inside[max(r0, 0) : max(r1, 0), max(c0, 0) : max(c1, 0)] = True
+        raster[~inside] = UNPROVEN
+    state = raster.reshape(-1)
+    _locate(cloud.x, cloud.y, x0, y0, cell, width, of_point)
+    fixed = cloud.fixed if cloud.fixed is not None else np.empty(0, np.bool_)
+    _lowest(cloud.x, cloud.y, cloud.z, fixed, x0, y0, of_point, pos, state)
+    return Cells(width, height, cell, x0, y0, of_point, pos, floor, state)
+
+
+def drop_low_outliers(cloud: Cloud, cells: Cells, peel: int, rounds: int = 2) -> None:
+    """Remove low points that lie alone more than 1 m below their surroundings (step 2)."""
+    again = np.empty(len(cells.state), np.uint8)
+    for _ in range(rounds):
+        _flag_outliers(cells.width, cells.pos, cells.floor, cells.state, 1000, peel, 6, again)
+        _next_lowest(
+            cloud.x, cloud.y, cloud.z, cells.x0, cells.y0, cells.of_point, cells.pos, cells.floor, cells.state, again
+        )

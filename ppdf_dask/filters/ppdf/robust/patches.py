@@ -1,0 +1,153 @@
+"""Patch continuity: roofs and crowns are patches whose surroundings are lower (step 6)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, UNPROVEN
+
+
+@njit(nogil=True, cache=True)
+def residual(planes: Any, squares: Any, p: Any, pos: Any, k: Any, cell: Any) -> Any:
+    """Height of the low point of cell `k` above plane `p`, metres."""
+    x = (pos[k, 0] - squares[p, 0] * cell) * 1e-3
+    y = (pos[k, 1] - squares[p, 1] * cell) * 1e-3
+    z = (pos[k, 2] - np.int64(squares[p, 3])) * 1e-3
+    return z - (planes[p, 2] + planes[p, 0] * x + planes[p, 1] * y)
+
+
+@njit(nogil=True, cache=True)
+def _root(parent: Any, p: Any) -> Any:
+    while parent[p] != p:
+        parent[p] = parent[parent[p]]
+        p = parent[p]
+    return p
+
+
+@njit(nogil=True, cache=True)
+def link_patches(
+    width: Any,
+    cell: Any,
+    pos: Any,
+    state: Any,
+    patch: Any,
+    planes: Any,
+    squares: Any,
+    count: Any,
+    near: Any,
+    agree: Any,
+    parent: Any,
+    open_: Any,
+) -> None:
+    """Unite patches whose planes agree; mark in `open_` the patches that touch something unproven."""
+    votes = np.zeros((count, 2), np.int32)
+    touched = np.empty(count, np.int64)
+    for p in range(count):
+        parent[p] = p
+        open_[p] = False
+    for p in range(count):
+        n = 0
+        c0, r0, size = squares[p, 0], squares[p, 1], squares[p, 2]
+        for r in range(r0, r0 + size):
+            for k in range(r * width + c0, r * width + c0 + size):
+                if patch[k] != p:
+                    continue
+                for dr in range(-near, near + 1):
+                    for j in range(k + dr * width - near, k + dr * width + near + 1):
+                        if state[j] & UNPROVEN:
+                            open_[p] = True
+                        q = patch[j]
+                        if q <= p:
+                            continue
+                        if votes[q, 0] == 0:
+                            touched[n] = q
+                            n += 1
+                        votes[q, 0] += 1
+                        if (
+                            abs(residual(planes, squares, p, pos, j, cell)) < agree
+                            and abs(residual(planes, squares, q, pos, k, cell)) < agree
+                        ):
+                            votes[q, 1] += 1
+        for m in range(n):
+            q = touched[m]
+            if 2 * votes[q, 1] >= votes[q, 0]:
+                a, b = _root(parent, p), _root(parent, q)
+                parent[max(a, b)] = min(a, b)
+            votes[q, 0] = 0
+            votes[q, 1] = 0
+    for p in range(count):
+        parent[p] = _root(parent, p)
+
+
+@njit(nogil=True, cache=True)
+def judge_components(
+    width: Any,
+    cell: Any,
+    pos: Any,
+    state: Any,
+    patch: Any,
+    planes: Any,
+    squares: Any,
+    count: Any,
+    parent: Any,
+    open_: Any,
+    reach: Any,
+    step: Any,
+    share: Any,
+    small: Any,
+    share_large: Any,
+    large: Any,
+) -> None:
+    """Drop the seeds of components that stand above their surroundings."""
+    tally = np.zeros((count, 3), np.int64)
+    box = np.empty((count, 4), np.int64)
+    box[:, 0:2] = 1 << 40
+    box[:, 2:4] = -1
+    shift = (1, -1, width, -width)
+    for k in range(len(state)):
+        p = patch[k]
+        if p < 0:
+            continue
+        root = parent[p]
+        if open_[p]:
+            open_[root] = True
+        row, col = k // width, k % width
+        box[root, 0] = min(box[root, 0], col)
+        box[root, 1] = min(box[root, 1], row)
+        box[root, 2] = max(box[root, 2], col)
+        box[root, 3] = max(box[root, 3], row)
+        for direction in range(4):
+            lowest = np.inf
+            j = k
+            for _ in range(reach):
+                j += shift[direction]
+                if patch[j] >= 0 and parent[patch[j]] == root:
+                    lowest = np.inf
+                    break
+                if state[j] & UNPROVEN:
+                    open_[root] = True
+                if state[j] & LOW:
+                    lowest = min(lowest, residual(planes, squares, p, pos, j, cell))
+            if lowest < np.inf:
+                tally[root, 0 if lowest < -step else (1 if lowest > step else 2)] += 1
+    verdict = np.zeros(count, np.uint8)
+    for p in range(count):
+        if parent[p] != p or box[p, 2] < 0:
+            continue
+        side = max(box[p, 2] - box[p, 0], box[p, 3] - box[p, 1]) + 1
+        side *= cell
+        total = tally[p, 0] + tally[p, 1] + tally[p, 2]
+        if open_[p]:
+            if side < max(small, large):
+                verdict[p] = UNPROVEN | MAYBE_DROPPED
+        elif (tally[p, 0] > share * total and side < small) or (tally[p, 0] > share_large * total and side < large):
+            verdict[p] = DROPPED
+    for k in range(len(state)):
+        if patch[k] >= 0 and not state[k] & FIXED:
+            v = verdict[parent[patch[k]]]
+            if v & DROPPED:
+                state[k] &= ~REF
+            state[k] |= v

@@ -1,0 +1,178 @@
+"""Progressive RANSAC planes over the low points and the seeds they give (steps 4 and 5)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from ppdf_dask.filters.ppdf.hashing import below, cell_seed
+from ppdf_dask.filters.ppdf.robust.cells import FIXED, LOW, MAYBE_DROPPED, REF, SQUARE, UNPROVEN
+
+
+@njit(nogil=True, cache=True)
+def _fit(xs: Any, ys: Any, zs: Any, n: Any, seed: Any, trials: Any, t_in: Any, best: Any) -> Any:
+    """Find the plane with the best score; return whether there is one, `best` gets (a, b, height at 0, 0)."""
+    best_score = -(1 << 30)
+    for t in range(trials):
+        i = below(seed, 3 * t, n)
+        j = below(seed, 3 * t + 1, n)
+        k = below(seed, 3 * t + 2, n)
+        if i in (j, k) or j == k:
+            continue
+        ux, uy, uz = xs[j] - xs[i], ys[j] - ys[i], zs[j] - zs[i]
+        vx, vy, vz = xs[k] - xs[i], ys[k] - ys[i], zs[k] - zs[i]
+        cross = ux * vy - uy * vx
+        if abs(cross) < 1e-3:
+            continue
+        a = (uz * vy - vz * uy) / cross
+        b = (ux * vz - vx * uz) / cross
+        tilt = a * a + b * b
+        if tilt > 1.0:
+            continue
+        h = zs[i] - a * xs[i] - b * ys[i]
+        limit = t_in * np.sqrt(1.0 + tilt)
+        score = 0
+        for m in range(n):
+            r = zs[m] - (h + a * xs[m] + b * ys[m])
+            if r < -limit:
+                score -= 1
+            elif r <= limit:
+                score += 1
+        if score > best_score:
+            best_score = score
+            best[0], best[1], best[2] = a, b, h
+    return best_score > -(1 << 30)
+
+
+@njit(nogil=True, cache=True)
+def _refit(xs: Any, ys: Any, zs: Any, n: Any, t_in: Any, best: Any) -> None:
+    """Least squares over the inliers of `best`, kept when its slope stays below 1."""
+    a, b, h = best[0], best[1], best[2]
+    limit = t_in * np.sqrt(1.0 + a * a + b * b)
+    cnt = 0
+    xm = ym = zm = 0.0
+    for m in range(n):
+        if abs(zs[m] - (h + a * xs[m] + b * ys[m])) <= limit:
+            cnt += 1
+            xm += xs[m]
+            ym += ys[m]
+            zm += zs[m]
+    if cnt < 3:
+        return
+    xm /= cnt
+    ym /= cnt
+    zm /= cnt
+    sxx = sxy = syy = sxz = syz = 0.0
+    for m in range(n):
+        if abs(zs[m] - (h + a * xs[m] + b * ys[m])) <= limit:
+            dx, dy, dz = xs[m] - xm, ys[m] - ym, zs[m] - zm
+            sxx += dx * dx
+            sxy += dx * dy
+            syy += dy * dy
+            sxz += dx * dz
+            syz += dy * dz
+    det = sxx * syy - sxy * sxy
+    if det < 1e-6 * (sxx + syy) ** 2 + 1e-9:
+        return
+    a = (sxz * syy - syz * sxy) / det
+    b = (syz * sxx - sxz * sxy) / det
+    if a * a + b * b > 1.0:
+        return
+    best[0], best[1], best[2] = a, b, zm - a * xm - b * ym
+
+
+@njit(nogil=True, cache=True)
+def find_planes(
+    width: Any,
+    height: Any,
+    cell: Any,
+    pos: Any,
+    state: Any,
+    patch: Any,
+    planes: Any,
+    squares: Any,
+    trials: Any,
+    refits: Any,
+    t_in: Any,
+    share: Any,
+    division: Any,
+) -> Any:
+    """Fit planes in all squares, set REF and the patch of the seeds; return the number of patches."""
+    cap = SQUARE * SQUARE
+    xs, ys, zs = np.empty(cap), np.empty(cap), np.empty(cap)
+    who = np.empty(cap, np.int64)
+    best = np.empty(3)
+    stack = np.empty((64, 3), np.int64)
+    count = 0
+    for row0 in range(0, height, SQUARE):
+        for col0 in range(0, width, SQUARE):
+            unknown = False
+            some = 0
+            for r in range(row0, row0 + SQUARE):
+                for k in range(r * width + col0, r * width + col0 + SQUARE):
+                    unknown |= (state[k] & UNPROVEN) != 0
+                    some += (state[k] & LOW) != 0
+            if some == 0:
+                continue
+            if unknown:
+                for r in range(row0, row0 + SQUARE):
+                    for k in range(r * width + col0, r * width + col0 + SQUARE):
+                        if state[k] & LOW and not state[k] & FIXED:
+                            state[k] |= UNPROVEN | MAYBE_DROPPED
+                continue
+            top = 1
+            stack[0, 0], stack[0, 1], stack[0, 2] = col0, row0, SQUARE
+            while top:
+                top -= 1
+                c0, r0, size = stack[top, 0], stack[top, 1], stack[top, 2]
+                n = 0
+                base = np.int64(0)
+                for r in range(r0, r0 + size):
+                    for k in range(r * width + c0, r * width + c0 + size):
+                        if state[k] & LOW:
+                            if n == 0:
+                                base = np.int64(pos[k, 2])
+                            xs[n] = (pos[k, 0] - c0 * cell) * 1e-3
+                            ys[n] = (pos[k, 1] - r0 * cell) * 1e-3
+                            zs[n] = (pos[k, 2] - base) * 1e-3
+                            who[n] = k
+                            n += 1
+                if n < 4:
+                    continue
+                split = True
+                seed = cell_seed(c0 - col0, r0 - row0, size)
+                if _fit(xs, ys, zs, n, seed, trials, t_in, best):
+                    for _ in range(refits):
+                        _refit(xs, ys, zs, n, t_in, best)
+                    a, b, h = best[0], best[1], best[2]
+                    norm = np.sqrt(1.0 + a * a + b * b)
+                    inside = 0
+                    deepest = 0.0
+                    for m in range(n):
+                        r_m = (zs[m] - (h + a * xs[m] + b * ys[m])) / norm
+                        inside += abs(r_m) <= t_in
+                        deepest = min(deepest, r_m)
+                    if inside >= 4 and inside >= share * n and deepest > -division:
+                        split = inside < 0.9 * n
+                        taken = 0
+                        for m in range(n):
+                            k = who[m]
+                            if patch[k] < 0 and abs(zs[m] - (h + a * xs[m] + b * ys[m])) / norm <= t_in:
+                                patch[k] = count
+                                state[k] |= REF
+                                taken += 1
+                        if taken:
+                            planes[count, 0], planes[count, 1], planes[count, 2] = a, b, h
+                            squares[count, 0], squares[count, 1], squares[count, 2] = c0, r0, size
+                            squares[count, 3] = base
+                            count += 1
+                if split and size > 2:
+                    half = size // 2
+                    for q in range(4):
+                        stack[top, 0] = c0 + (q & 1) * half
+                        stack[top, 1] = r0 + (q >> 1) * half
+                        stack[top, 2] = half
+                        top += 1
+    return count

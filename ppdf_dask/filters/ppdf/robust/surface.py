@@ -1,0 +1,149 @@
+"""The reference surface at a place: nearest references in four quadrants and a plane through them (paper, 2.5)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from ppdf_dask.filters.ppdf.robust.cells import REF, UNPROVEN
+
+
+@njit(nogil=True, cache=True)
+def nearest(
+    state: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, rings: Any, limit2: Any, found: Any
+) -> Any:
+    """Find the nearest reference in each quadrant around (`x`, `y`) of cell `k`; tell whether unproven cells were seen."""
+    row, col = k // width, k % width
+    fx = x - col * cell
+    fy = y - row * cell
+    best0 = best1 = best2 = best3 = np.int64(1) << 60
+    found[0] = found[1] = found[2] = found[3] = -1
+    seen = np.uint8(0)
+    for ring in range(rings + 1):
+        for dr in range(-ring, ring + 1):
+            base = k + dr * width
+            step = 1 if abs(dr) == ring or ring == 0 else 2 * ring
+            for j in range(base - ring, base + ring + 1, step):
+                s = state[j]
+                if not s & (REF | UNPROVEN):
+                    continue
+                seen |= s
+                if not s & REF:
+                    continue
+                dx = np.int64(pos[j, 0]) - x
+                dy = np.int64(pos[j, 1]) - y
+                d2 = dx * dx + dy * dy
+                if d2 > limit2:
+                    continue
+                if dx > 0 and dy >= 0:
+                    if d2 < best0 or (d2 == best0 and before(pos, j, found[0])):
+                        best0 = d2
+                        found[0] = j
+                elif dx <= 0 and dy > 0:
+                    if d2 < best1 or (d2 == best1 and before(pos, j, found[1])):
+                        best1 = d2
+                        found[1] = j
+                elif dx < 0:
+                    if d2 < best2 or (d2 == best2 and before(pos, j, found[2])):
+                        best2 = d2
+                        found[2] = j
+                elif dy < 0 and (d2 < best3 or (d2 == best3 and before(pos, j, found[3]))):
+                    best3 = d2
+                    found[3] = j
+        right = (ring + 1) * cell - fx
+        left = ring * cell + fx
+        top = (ring + 1) * cell - fy
+        bottom = ring * cell + fy
+        b = min(right, top)
+        if best0 >= b * b:
+            continue
+        b = min(left, top)
+        if best1 >= b * b:
+            continue
+        b = min(left, bottom)
+        if best2 >= b * b:
+            continue
+        b = min(right, bottom)
+        if best3 >= b * b:
+            continue
+        break
+    return (seen & UNPROVEN) != 0
+
+
+@njit(nogil=True, cache=True)
+def before(pos: Any, j: Any, k: Any) -> Any:
+    """Tell whether the low point of cell `j` comes before that of `k` in the order (z, x, y)."""
+    if pos[j, 2] != pos[k, 2]:
+        return pos[j, 2] < pos[k, 2]
+    if pos[j, 0] != pos[k, 0]:
+        return pos[j, 0] < pos[k, 0]
+    return pos[j, 1] < pos[k, 1]
+
+
+@njit(nogil=True, cache=True)
+def height_above(pos: Any, x: Any, y: Any, z: Any, found: Any, soft: Any) -> Any:
+    """Return (count, height above the surface, slope, distance and height above the nearest reference), metres."""
+    n = 0
+    near = -1
+    near2 = np.int64(1) << 60
+    for q in range(4):
+        j = found[q]
+        if j < 0:
+            continue
+        n += 1
+        dx = np.int64(pos[j, 0]) - x
+        dy = np.int64(pos[j, 1]) - y
+        d2 = dx * dx + dy * dy
+        if d2 < near2 or (d2 == near2 and before(pos, j, near)):
+            near2 = d2
+            near = j
+    if n == 0:
+        return 0, 0.0, 0.0, 0.0, 0.0
+    d = np.sqrt(near2 * 1e-6)
+    step = (z - np.int64(pos[near, 2])) * 1e-3
+    ws = 0.0
+    xm = ym = zm = 0.0
+    weak = 1e-4 if n < 3 else soft
+    for q in range(4):
+        j = found[q]
+        if j >= 0:
+            dx = (pos[j, 0] - np.int64(x)) * 1e-3
+            dy = (pos[j, 1] - np.int64(y)) * 1e-3
+            w = 1.0 / (dx * dx + dy * dy + weak)
+            ws += w
+            xm += w * dx
+            ym += w * dy
+            zm += w * ((pos[j, 2] - np.int64(z)) * 1e-3)
+    xm /= ws
+    ym /= ws
+    zm /= ws
+    if n < 3:
+        return n, -zm, 0.0, d, step
+    scale = n / ws
+    sxx = syy = soft
+    sxy = sxz = syz = 0.0
+    for q in range(4):
+        j = found[q]
+        if j >= 0:
+            dx = (pos[j, 0] - np.int64(x)) * 1e-3
+            dy = (pos[j, 1] - np.int64(y)) * 1e-3
+            w = scale / (dx * dx + dy * dy + weak)
+            dz = (pos[j, 2] - np.int64(z)) * 1e-3 - zm
+            dx -= xm
+            dy -= ym
+            sxx += w * dx * dx
+            sxy += w * dx * dy
+            syy += w * dy * dy
+            sxz += w * dx * dz
+            syz += w * dy * dz
+    det = sxx * syy - sxy * sxy
+    a = (sxz * syy - syz * sxy) / det
+    b = (syz * sxx - sxz * sxy) / det
+    slope = np.sqrt(a * a + b * b)
+    if slope > 3.0:
+        a *= 3.0 / slope
+        b *= 3.0 / slope
+        slope = 3.0
+    return n, a * xm + b * ym - zm, slope, d, step

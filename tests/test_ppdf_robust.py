@@ -1,0 +1,164 @@
+"""The robust profile: proof against cutting, order, duplicates, degenerate input."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ppdf_dask.errors import ParameterError
+from ppdf_dask.filters import classify_ground, get
+from ppdf_dask.filters.cloud import Cloud, Density, cloud_from_grid
+from ppdf_dask.filters.ppdf.robust import windows
+from ppdf_dask.filters.ppdf.robust.classify import classify
+from ppdf_dask.filters.ppdf.robust.params import RobustParams
+from ppdf_dask.grid import Rect
+
+SMALL = RobustParams(cell_size=1.0, search_radius=6.0, largest_building=24.0)
+
+
+def scene(seed, n=2500, side=110.0, snap=1):
+    """Hills, a cliff, boxes, scattered vegetation, low outliers, holes; absolute millimetres."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0, side, (n, 2))
+    for _ in range(rng.integers(0, 4)):
+        hole = rng.uniform(0, side, 2)
+        xy = xy[np.abs(xy - hole).max(axis=1) > rng.uniform(1, 14)]
+    x, y = xy.T
+    z = rng.uniform(0, 8) * np.sin(x / 17) * np.cos(y / 23) + rng.uniform(-0.7, 0.7) * x
+    z += np.where(x > rng.uniform(0, 2 * side), 6.0, 0.0) + rng.normal(0, 0.05, len(x))
+    for _ in range(rng.integers(0, 6)):
+        a, b = rng.uniform(0, side, 2)
+        w, h = rng.uniform(3, 30, 2)
+        z += np.where((np.abs(x - a) < w / 2) & (np.abs(y - b) < h / 2), rng.uniform(2, 9), 0.0)
+    z += np.where(rng.random(len(x)) < 0.2, rng.exponential(2.0, len(x)), 0.0)
+    z -= np.where(rng.random(len(x)) < 0.01, rng.uniform(2, 9, len(x)), 0.0)
+    mm = np.rint(np.column_stack([x, y, z]) * 1000 / snap).astype(np.int64) * snap
+    return mm + np.array([500_000_000, 5_400_000_000, 0]) // 16_000 * 16_000 - np.array([40_000, 3_000, 0])
+
+
+def crop(points, rect):
+    x, y, _z = points.T
+    inside = np.flatnonzero((x >= rect.x0) & (x < rect.x1) & (y >= rect.y0) & (y < rect.y1))
+    base = np.array([rect.x0, rect.y0, 0])
+    px, py, pz = (points[inside] - base).astype(np.int32).T
+    return inside, Cloud(px, py, pz, (rect.x0, rect.y0), len(inside), rect)
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=seeds, fraction=st.tuples(*[st.floats(0, 0.45)] * 4), snap=st.sampled_from([1, 500]))
+def test_what_is_proven_in_a_crop_is_true_of_the_whole(seed, fraction, snap):
+    points = scene(seed, snap=snap)
+    whole = classify(cloud_from_grid(*points.T), SMALL)
+    assert not whole.unproven.any()
+    (x0, y0, _), (x1, y1, _) = points.min(axis=0), points.max(axis=0) + 1
+    w, h = x1 - x0, y1 - y0
+    a, b, c, d = fraction
+    rect = Rect(int(x0 + a * w), int(y0 + b * h), int(x1 - c * w), int(y1 - d * h))
+    inside, cloud = crop(points, rect)
+    cut = classify(cloud, SMALL)
+    proven = ~cut.unproven
+    assert np.array_equal(cut.ground[proven], whole.ground[inside][proven])
+
+
+def test_a_wide_crop_proves_its_middle():
+    points = scene(5, n=9000, side=220.0)
+    (x0, y0, _), (x1, y1, _) = points.min(axis=0), points.max(axis=0) + 1
+    rect = Rect(int(x0) + 3000, int(y0) + 3000, int(x1) - 3000, int(y1) - 3000)
+    inside, cloud = crop(points, rect)
+    cut = classify(cloud, SMALL)
+    middle = np.abs(points[inside] - [(x0 + x1) // 2, (y0 + y1) // 2, 0])[:, :2].max(axis=1) < 30_000
+    assert middle.sum() > 500
+    assert cut.unproven[middle].mean() < 0.02
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=seeds, snap=st.sampled_from([1, 500]))
+def test_neither_order_nor_duplicates_nor_place_decide(seed, snap):
+    points = scene(seed, snap=snap)
+    rng = np.random.default_rng(seed)
+    plain = classify(cloud_from_grid(*points.T), SMALL).ground
+    order = rng.permutation(len(points))
+    assert np.array_equal(classify(cloud_from_grid(*points[order].T), SMALL).ground, plain[order])
+    twice = np.concatenate([points, points[order[: len(order) // 3]]])
+    doubled = classify(cloud_from_grid(*twice.T), SMALL).ground
+    assert np.array_equal(doubled, np.concatenate([plain, plain[order[: len(order) // 3]]]))
+    moved = points + np.array([-7 * 16_000, 3 * 16_000, 123_457])
+    assert np.array_equal(classify(cloud_from_grid(*moved.T), SMALL).ground, plain)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=seeds)
+def test_windows_change_nothing(seed):
+    points = scene(seed, n=1500)
+    far = points + np.array([900_000_000, -64_000_000, 0])
+    both = np.concatenate([points, far, points[:1] + np.array([1_700_000_000, 5_000_000, 0])])
+    cloud = cloud_from_grid(*both.T)
+    assert not windows.fits_one_grid(cloud, SMALL.cell_mm)
+    verdict = classify(cloud, SMALL)
+    assert not verdict.unproven.any()
+    expected = [classify(cloud_from_grid(*part.T), SMALL).ground for part in (points, far)]
+    assert np.array_equal(verdict.ground, np.concatenate([*expected, [False]]))
+
+
+def test_windows_are_widened_until_they_prove_themselves(monkeypatch):
+    points = scene(11, n=9000, side=300.0)
+    cloud = cloud_from_grid(*points.T)
+    whole = classify(cloud, SMALL).ground
+    monkeypatch.setattr(windows, "WINDOW", 64)
+    monkeypatch.setattr(windows, "CELLS_AT_LEAST", 1)
+    monkeypatch.setattr(windows, "CELLS_PER_POINT", 0)
+    verdict = classify(cloud, SMALL)
+    assert not verdict.unproven.any()
+    assert np.array_equal(verdict.ground, whole)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_fewer_than_four_low_points_are_not_ground(n):
+    assert not classify_ground(np.zeros((n, 3)) + np.arange(n)[:, None]).any()
+
+
+@pytest.mark.parametrize(
+    "xyz",
+    [
+        np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]]),
+        np.tile([[5.0, 5.0, 5.0]], (1000, 1)),
+        np.array([[0.0, 0, 0], [2_000_000, 0, 0], [0, 2_000_000, 1]]),
+    ],
+)
+def test_what_carries_no_plane_is_not_ground(xyz):
+    assert not classify_ground(xyz).any()
+
+
+def test_a_noise_of_a_million_metres_is_not_ground():
+    rng = np.random.default_rng(1)
+    xyz = np.column_stack([rng.uniform(0, 60, (4000, 2)), rng.normal(0, 0.03, 4000)])
+    xyz[::97, 2] += np.where(rng.random(len(xyz[::97])) < 0.5, -1e6, 1e6)
+    ground = classify_ground(xyz)
+    assert not ground[::97].any()
+    assert np.delete(ground, np.s_[::97]).mean() > 0.99
+
+
+def test_fixed_points_are_ground_and_references():
+    points = scene(3)
+    cloud = cloud_from_grid(*points.T)
+    fixed = np.zeros(cloud.n, np.bool_)
+    high = int(np.argmax(points[:, 2]))
+    fixed[high] = True
+    verdict = classify(Cloud(cloud.x, cloud.y, cloud.z, cloud.origin, cloud.n_core, None, fixed), SMALL)
+    assert not classify(cloud, SMALL).ground[high]
+    assert verdict.ground[high]
+
+
+@pytest.mark.parametrize(("points", "cells", "size"), [(225, 4, 1.0), (224, 4, 1.25), (1, 1, 4.0)])
+def test_the_cell_follows_the_density(points, cells, size):
+    resolved = RobustParams().resolve(Density(points, cells))
+    assert resolved.cell_size == size
+    assert resolved.resolve(Density(10**9, 1)) is resolved
+
+
+def test_an_unresolved_cell_size_is_refused():
+    with pytest.raises(ParameterError, match="cell_size is not set"):
+        get("ppdf").classify(cloud_from_grid(*scene(1).T), RobustParams())
