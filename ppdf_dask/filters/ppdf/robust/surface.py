@@ -14,7 +14,7 @@ from ppdf_dask.filters.ppdf.robust.cells import REF, UNPROVEN
 def nearest(
     state: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, rings: Any, limit2: Any, found: Any
 ) -> Any:
-    """Find the nearest reference in each quadrant around (`x`, `y`) of cell `k`; tell whether unproven cells were seen."""
+    """Find the nearest reference in each quadrant around (`x`, `y`) of cell `k`; tell if unproven cells were seen."""
     row, col = k // width, k % width
     fx = x - col * cell
     fy = y - row * cell
