@@ -92,7 +92,7 @@ def in_circle(ax, ay, bx, by, cx, cy, dx, dy):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _locate(vertices, triangles, t, x, y):  # type: ignore[no-untyped-def]
+def locate(vertices, triangles, t, x, y):  # type: ignore[no-untyped-def]
     """Walk from triangle `t` to a triangle that holds (x, y), edges included."""
     came = -1
     while True:
@@ -157,34 +157,41 @@ def _legalise(vertices, triangles, stack, depth, x, y):  # type: ignore[no-untyp
 
 
 @njit(nogil=True, cache=True)
+def insert_at(vertices, triangles, stack, count, t, x, y, z):  # type: ignore[no-untyped-def]
+    """Insert a point into the triangle `t` that holds it; return the new number of vertices.
+
+    Of points at one place the lowest z stays and the number does not grow. Otherwise the point is vertex `count`; the
+    changed triangles are those around it, it has slot 0 in each, and `t` is one of them.
+    """
+    for i in range(3):
+        v = triangles[t, i]
+        if vertices[v, 0] == x and vertices[v, 1] == y:
+            vertices[v, 2] = min(vertices[v, 2], z)
+            return count
+    p, u = count, 2 * count - 6
+    w = u + 1
+    vertices[p, 0], vertices[p, 1], vertices[p, 2] = x, y, z
+    a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+    na, nb, nc = triangles[t, 3], triangles[t, 4], triangles[t, 5]
+    _set(triangles, t, p, a, b, nc, u, w)
+    _set(triangles, u, p, b, c, na, w, t)
+    _set(triangles, w, p, c, a, nb, t, u)
+    _relink(triangles, na, t, u)
+    _relink(triangles, nb, t, w)
+    stack[0], stack[1], stack[2] = t, u, w
+    _legalise(vertices, triangles, stack, 3, x, y)
+    return count + 1
+
+
+@njit(nogil=True, cache=True)
 def _insert(points, order, vertices, triangles, count):  # type: ignore[no-untyped-def]
     """Insert `points` in `order`; return the new number of vertices. Of points at one place the lowest z stays."""
     stack = np.empty(len(triangles), np.int32)
     t = 2 * count - 7
     for k in order:
         x, y, z = np.int64(points[k, 0]), np.int64(points[k, 1]), points[k, 2]
-        t = _locate(vertices, triangles, t, x, y)
-        twin = -1
-        for i in range(3):
-            v = triangles[t, i]
-            if vertices[v, 0] == x and vertices[v, 1] == y:
-                twin = v
-        if twin >= 0:
-            vertices[twin, 2] = min(vertices[twin, 2], z)
-            continue
-        p, u = count, 2 * count - 6
-        w = u + 1
-        count += 1
-        vertices[p, 0], vertices[p, 1], vertices[p, 2] = x, y, z
-        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        na, nb, nc = triangles[t, 3], triangles[t, 4], triangles[t, 5]
-        _set(triangles, t, p, a, b, nc, u, w)
-        _set(triangles, u, p, b, c, na, w, t)
-        _set(triangles, w, p, c, a, nb, t, u)
-        _relink(triangles, na, t, u)
-        _relink(triangles, nb, t, w)
-        stack[0], stack[1], stack[2] = t, u, w
-        _legalise(vertices, triangles, stack, 3, x, y)
+        t = locate(vertices, triangles, t, x, y)
+        count = insert_at(vertices, triangles, stack, count, t, x, y, z)
     return count
 
 
