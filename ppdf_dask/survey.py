@@ -1,0 +1,353 @@
+"""The header-only scan: files in, a `Survey` out. No point is read; a tile costs a few kilobytes of reading."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+from ppdf_dask import crs as crs_module
+from ppdf_dask.crs import Frame
+from ppdf_dask.errors import SurveyError, TileError
+from ppdf_dask.grid import MM, Rect
+from ppdf_dask.lasheader import Header, Reject, read_header
+from ppdf_dask.pairs import Duplicates, Overlap, duplicate_problems, find_duplicates, find_overlaps
+from ppdf_dask.params import ClassRules
+from ppdf_dask.reader import batches
+from ppdf_dask.tiles import Problem, Tile, bounds_in_mm, find_files, named, output_names, problem_dict, shown
+
+__all__ = ["Duplicates", "Overlap", "Problem", "Survey", "Tile", "find_overlaps", "measure", "scan"]
+
+_DEGREE_SCALE = 1e-5
+_DEGREES = "has no CRS and looks like degrees; reproject it, or say the unit with --assume-units"
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The delivery as its headers describe it.
+
+    Attributes
+    ----------
+    tiles : tuple of Tile
+        Sorted by path.
+    root : str
+        The folder that the tiles' names are relative to.
+    crs : str or None
+        WKT2 of the survey; None when no tile has one.
+    unit_xy, unit_z : float
+        Metres per horizontal and vertical unit of the files.
+    problems : tuple of Problem
+        Warnings, and the files left out.
+    """
+
+    tiles: tuple[Tile, ...]
+    root: str
+    crs: str | None
+    unit_xy: float
+    unit_z: float
+    problems: tuple[Problem, ...] = ()
+
+    @property
+    def point_count(self) -> int:
+        """Points in all tiles, as their headers say."""
+        return sum(t.point_count for t in self.tiles)
+
+    @cached_property
+    def bounds(self) -> Rect | None:
+        """Box around all tiles that have points, mm; None when there is none."""
+        boxes = [t.bounds for t in self.tiles if t.point_count]
+        if not boxes:
+            return None
+        return Rect(
+            min(b.x0 for b in boxes), min(b.y0 for b in boxes), max(b.x1 for b in boxes), max(b.y1 for b in boxes)
+        )
+
+    @cached_property
+    def overlaps(self) -> tuple[Overlap, ...]:
+        """Pairs of tiles whose header bounds overlap by more than 1 mm, by path."""
+        return find_overlaps(self.tiles)
+
+    @cached_property
+    def crs_name(self) -> str:
+        """Short name of the CRS for people."""
+        return crs_module.crs_name(self.crs)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types; `from_dict` reads them."""
+        return {
+            "root": self.root,
+            "crs": self.crs,
+            "unit_xy": self.unit_xy,
+            "unit_z": self.unit_z,
+            "tiles": [t.as_dict() for t in self.tiles],
+            "problems": [problem_dict(p) for p in self.problems],
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Survey:
+        """Build a survey from `as_dict`."""
+        return cls(
+            tiles=tuple(Tile.from_dict(t) for t in values["tiles"]),
+            root=values["root"],
+            crs=values["crs"],
+            unit_xy=values["unit_xy"],
+            unit_z=values["unit_z"],
+            problems=tuple(Problem(**p) for p in values["problems"]),
+        )
+
+    def __repr__(self) -> str:
+        from ppdf_dask.surveyview import as_text
+
+        return as_text(self)
+
+    def _repr_html_(self) -> str:
+        from ppdf_dask.surveyview import as_html
+
+        return as_html(self)
+
+
+def scan(
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    *,
+    assume_crs: Any = None,
+    assume_units: crs_module.Units | None = None,
+    duplicates: Duplicates = "error",
+    skip_bad: bool = False,
+) -> Survey:
+    """Read the headers of a delivery.
+
+    Parameters
+    ----------
+    paths : path-like or iterable of path-like
+        Any mix of files, folders (recursive) and globs of ``.las``, ``.laz`` and ``.copc.laz`` in any case.
+    assume_crs : str, int or pyproj.CRS, optional
+        The CRS of tiles that have none, or none that can be understood.
+    assume_units : {"m", "ft", "us-ft"}, optional
+        The unit of x, y and z, whatever the CRS says. Default: the CRS's own; metres when no tile has a CRS.
+    duplicates : {"error", "keep", "first"}
+        What to do with the same file found twice: refuse (the default, since points would count twice), keep both, or
+        use the first by path.
+    skip_bad : bool
+        Leave files with fatal problems out, and list them in `Survey.problems`, instead of refusing the survey.
+
+    Returns
+    -------
+    Survey
+
+    Raises
+    ------
+    SurveyError
+        When nothing is found; a file cannot be used; CRS are mixed, missing in some tiles or in degrees; or a tile is
+        there twice. The message names the files and the option that helps.
+    """
+    if duplicates not in ("error", "keep", "first"):
+        raise SurveyError(f"duplicates = {duplicates!r} is unknown; choose 'error', 'keep' or 'first'")
+    units = None if assume_units is None else crs_module.units_from_user(assume_units)
+    assumed = None if assume_crs is None else crs_module.from_user(assume_crs)
+    listed = [paths] if isinstance(paths, str | os.PathLike) else paths
+    files, root = find_files(listed)
+    names, problems = output_names(files, root)
+    repeated = sorted({a for a, b in pairwise(files) if a == b})
+
+    headers: dict[str, Header] = {}
+    for path in names:
+        try:
+            headers[path] = read_header(path)
+        except Reject as reject:
+            problems.append(Problem(path, reject.code, reject.message, True))
+        else:
+            problems += [Problem(path, code, message, False) for code, message in headers[path].warnings]
+    frames = {path: _frame(h, assumed) for path, h in headers.items()}
+    for path, frame in frames.items():
+        fault = frame.fault
+        if fault is not None and not (units is not None and fault[0] in ("crs-unreadable", "units")):
+            problems.append(Problem(path, fault[0], fault[1] + _remedy(fault[0]), True))
+    _refuse(problems, skip_bad)
+    bad = {p.path for p in problems if p.fatal}
+    good = {path: h for path, h in headers.items() if path not in bad}
+
+    reference, notes = _common_frame({path: frames[path] for path in good}, units)
+    problems += notes
+    twins = find_duplicates(good)
+    problems += duplicate_problems(repeated, twins, duplicates)
+    if duplicates == "first":
+        for later in (path for group in twins for path in group[1:]):
+            del good[later]
+    tiles = []
+    for path, header in sorted(good.items()):
+        if reference.wkt is None and units is None and _like_degrees(header):
+            problems.append(Problem(path, "degrees", _DEGREES, True))
+            continue
+        tile, notes = _tile(path, names[path], header, reference)
+        tiles.append(tile)
+        problems += notes
+    _refuse(problems, skip_bad)
+    bad = {p.path for p in problems if p.fatal}
+    return Survey(
+        tiles=tuple(t for t in tiles if t.path not in bad),
+        root=root,
+        crs=reference.wkt,
+        unit_xy=reference.unit_xy or 1.0,
+        unit_z=reference.unit_z or reference.unit_xy or 1.0,
+        problems=tuple(sorted(problems, key=lambda p: (p.path, not p.fatal, p.code))),
+    )
+
+
+def _frame(header: Header, assumed: Frame | None) -> Frame:
+    frame = crs_module.from_records(header.wkt, header.geo_keys, header.wkt_first)
+    if assumed is not None and (frame is crs_module.NOTHING or (frame.fault and frame.fault[0] == "crs-unreadable")):
+        return assumed
+    return frame
+
+
+def _remedy(code: str) -> str:
+    if code == "crs-unreadable":
+        return "; say what it is with --assume-crs, or only its unit with --assume-units"
+    return "; say which unit it is with --assume-units" if code == "units" else ""
+
+
+def _refuse(problems: Sequence[Problem], skip_bad: bool) -> None:
+    """Raise for fatal problems unless they may be skipped."""
+    fatal = [p for p in problems if p.fatal]
+    if not fatal or skip_bad:
+        return
+    files = len({p.path for p in fatal})
+    raise SurveyError(
+        f"{files} file{'s' if files > 1 else ''} cannot be used:\n{named(map(str, fatal))}\n"
+        "Repair or remove them, or leave them out with --skip-bad (skip_bad=True)."
+    )
+
+
+def _common_frame(frames: dict[str, Frame], units: float | None) -> tuple[Frame, list[Problem]]:
+    """Return the one CRS and units of all files, or refuse."""
+    if not frames:
+        raise SurveyError("no tile is left to work on; every file has a problem")
+    by_frame: dict[Frame, list[str]] = defaultdict(list)
+    for path, frame in sorted(frames.items()):
+        by_frame[Frame(frame.wkt, frame.unit_xy, frame.unit_z)].append(path)
+    missing = [path for frame, group in by_frame.items() if frame.wkt is None for path in group]
+    known = [frame for frame in by_frame if frame.wkt is not None]
+    notes: list[Problem] = []
+    if missing and known:
+        raise SurveyError(
+            f"{len(missing)} of {len(frames)} tiles have no CRS:\n{named(map(shown, missing))}\n"
+            "Say what it is with --assume-crs (assume_crs=), or scan them on their own."
+        )
+    if not known:
+        unit = 1.0 if units is None else units
+        said = "taken to be metres" if units is None else f"in {crs_module.unit_name(unit)}, as --assume-units says"
+        notes.append(Problem("", "crs-missing", f"no tile has a CRS; coordinates are {said}", False))
+        return Frame(None, unit, unit), notes
+    reference = _merge_frames(known, by_frame, notes)
+    if units is not None:
+        return Frame(reference.wkt, units, units), notes
+    if reference.unit_z is None:
+        name = crs_module.unit_name(reference.unit_xy or 1.0)
+        if reference.unit_xy != 1.0:
+            message = f"the CRS says nothing of heights; they are taken to be in its horizontal unit, {name}"
+            notes.append(Problem("", "height-unit", message, False))
+        return Frame(reference.wkt, reference.unit_xy, reference.unit_xy), notes
+    return reference, notes
+
+
+def _merge_frames(known: list[Frame], by_frame: dict[Frame, list[str]], notes: list[Problem]) -> Frame:
+    """Return the most complete of equivalent frames; refuse a true mix."""
+    groups: list[list[Frame]] = []
+    for frame in known:
+        home = next((g for g in groups if crs_module.compare(g[0].wkt or "", frame.wkt or "") != "different"), None)
+        if home is None:
+            groups.append([frame])
+        else:
+            home.append(frame)
+    if len(groups) > 1:
+        parts = []
+        for group in groups:
+            paths = sorted(path for frame in group for path in by_frame[frame])
+            parts.append(f"{crs_module.crs_name(group[0].wkt)}, {len(paths)} tiles:\n{named(map(shown, paths))}")
+        raise SurveyError(
+            "the tiles have different coordinate reference systems:\n"
+            + "\n".join(parts)
+            + "\nReproject them to one, or run each group on its own."
+        )
+    group = groups[0]
+    full = [f for f in group if f.unit_z is not None] or group
+    bare = [path for f in group if f.unit_z is None for path in by_frame[f]]
+    heights = {f.unit_z for f in full}
+    unlike = any(crs_module.compare(full[0].wkt or "", f.wkt or "") == "different" for f in full)
+    if len(heights) > 1 or unlike or (bare and full is not group and heights != {full[0].unit_xy}):
+        lines = [f"{crs_module.crs_name(f.wkt)}: {shown(by_frame[f][0])} ..." for f in group]
+        raise SurveyError(
+            f"the tiles agree in the plane but not in height:\n{named(lines)}\n"
+            "Bring them to one height system, or say the unit of all with --assume-units."
+        )
+    if bare and full is not group:
+        message = f"{len(bare)} tiles say nothing of their heights; they are taken to be like the others"
+        notes.append(Problem("", "height-missing", message, False))
+    return full[0]
+
+
+def _tile(path: str, name: str, header: Header, frame: Frame) -> tuple[Tile, list[Problem]]:
+    """Return the tile and what is odd about it; only impossible header bounds make it read the points."""
+    unit_xy, unit_z = frame.unit_xy or 1.0, frame.unit_z or frame.unit_xy or 1.0
+    found = bounds_in_mm(header.mins, header.maxs, unit_xy, unit_z) if _bounds_possible(header) else None
+    tile = Tile(
+        path=path,
+        name=name,
+        size=header.size,
+        mtime_ns=header.mtime_ns,
+        version=header.version,
+        point_format=header.point_format,
+        record_length=header.record_length,
+        point_count=header.point_count,
+        first_returns=header.first_returns,
+        scales=header.scales,
+        offsets=header.offsets,
+        bounds=found[0] if found and header.point_count else Rect(0, 0, 0, 0),
+        z_range=found[1] if found and header.point_count else (0.0, 0.0),
+        crs=frame.wkt,
+        compressed=header.laszip is not None,
+        copc=header.copc,
+        evlr_count=header.evlr_count,
+        guid=header.guid,
+    )
+    if header.point_count == 0:
+        return tile, [Problem(path, "no-points", "has no points; an empty tile is written", False)]
+    if found:
+        return tile, []
+    try:
+        bounds, z_range = measure(tile, unit_xy, unit_z)
+    except TileError as error:
+        return tile, [Problem(path, "corrupt", str(error), True)]
+    message = "has header bounds that cannot be true; they were measured by reading its points"
+    return replace(tile, bounds=bounds, z_range=z_range), [Problem(path, "bounds", message, False)]
+
+
+def measure(tile: Tile, unit_xy: float, unit_z: float) -> tuple[Rect, tuple[float, float]]:
+    """Return the true bounds of a tile (mm) and its lowest and highest z (m) by reading all its points."""
+    low: list[int] = []
+    high: list[int] = []
+    for batch in batches(tile, unit_xy=unit_xy, unit_z=unit_z, rules=ClassRules(), returns="all"):
+        here = [(int(v.min()), int(v.max())) for v in (batch.x, batch.y, batch.z)]
+        low = [min(a, b) for a, (b, _) in zip(low or [h[0] for h in here], here, strict=True)]
+        high = [max(a, b) for a, (_, b) in zip(high or [h[1] for h in here], here, strict=True)]
+    return Rect(low[0], low[1], high[0] + 1, high[1] + 1), (low[2] / MM, high[2] / MM)
+
+
+def _bounds_possible(header: Header) -> bool:
+    """Tell whether 32-bit integers with the header's scale and offset can reach its bounds."""
+    if header.point_count > 1 and not any(header.mins) and not any(header.maxs):
+        return False
+    return all(
+        low <= high and o - s * 2.0**31 - s <= low and high <= o + s * 2.0**31 + s
+        for low, high, s, o in zip(header.mins, header.maxs, header.scales, header.offsets, strict=True)
+    )
+
+
+def _like_degrees(header: Header) -> bool:
+    """Tell whether coordinates without a CRS look like degrees: small numbers in very small steps."""
+    largest = max(map(abs, (*header.mins[:2], *header.maxs[:2])))
+    return header.point_count > 0 and largest <= 360 and max(header.scales[:2]) < _DEGREE_SCALE
