@@ -7,8 +7,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING
 
-from ppdf_dask.grid import Rect
+from ppdf_dask.grid import ChunkGrid, Rect
+
+if TYPE_CHECKING:
+    from ppdf_dask.plan import Plan
+    from ppdf_dask.result import Result
 
 PALETTE: Mapping[str, str] = {
     "blue": "#0072B2",
@@ -96,6 +101,24 @@ def svg_map(patches: Sequence[Patch], *, width: int = 480, legend: Mapping[str, 
     total = height + (10 + 18 * len(legend) if legend else 0)
     view = f'viewBox="-2 -2 {width + 4} {total + 4}" width="{width + 4}" height="{total + 4}"'
     return f'<svg xmlns="http://www.w3.org/2000/svg" {view} role="img">' + "".join(parts + rows) + "</svg>"
+
+
+def plan_html(plan: Plan) -> str:
+    """Return a plan as an HTML fragment: its chunks over its tiles, and its facts."""
+    chunks = [Patch(c.core, f"{c.id}: about {c.points:,.0f} points", "sky") for c in plan.chunks]
+    tiles = [Patch(t.bounds, f"{t.name}: {t.point_count:,} points", "grey") for t in plan.survey.tiles if t.point_count]
+    return _fragment(svg_map(tiles + chunks, legend={"sky": "chunk", "grey": "tile"}), repr(plan))
+
+
+def result_html(result: Result) -> str:
+    """Return a finished run as an HTML fragment: its chunks, and its facts."""
+    grid = ChunkGrid.from_metres(result.summary["plan"]["chunk_size_m"])
+    chunks = [Patch(grid.parse(name).core, name, "green") for name in result.chunks]
+    return _fragment(svg_map(chunks, legend={"green": "classified chunk"}), repr(result))
+
+
+def _fragment(drawing: str, text: str) -> str:
+    return f"<div>{drawing}<pre>{escape(text)}</pre></div>"
 
 
 def _hex(colour: str) -> str:
