@@ -148,7 +148,8 @@ def open_dtm(store: str | os.PathLike[str], variable: str = "height", *, dask: b
     dataset = xr.open_zarr(group, consolidated=False, chunks=chunks, decode_coords="all")
     if variable not in dataset:
         raise StoreError(f"{group} has no {variable!r}; it has {', '.join(map(str, dataset.data_vars))}")
-    return dataset[variable]
+    array: xr.DataArray = dataset[variable]
+    return array
 
 
 def import_rio() -> None:
@@ -204,7 +205,7 @@ def write_cog(dtm: xr.DataArray, path: str | os.PathLike[str]) -> Path:
     try:
         with rasterio.open(plain, "w", **profile) as target:
             target.units = (str(dtm.attrs.get("units", "")),)
-            target.set_band_description(1, str(dtm.name or "height"))
+            target.set_band_description(1, "height" if dtm.name is None else str(dtm.name))
             for r, c in _windows(rows, columns):
                 # Not on the cluster: this runs inside one of its tasks.
                 part = dtm[r : r + BLOCK, c : c + BLOCK].compute(scheduler="synchronous")
