@@ -161,6 +161,10 @@ class RunStore:
             source: values[bounds[k] : bounds[k + 1]].view(np.bool_) for k, source in enumerate(attributes["sources"])
         }
 
+    def classified(self) -> list[str]:
+        """Return the sorted ids of all chunks that have a mask."""
+        return self._children("classification")
+
     def write_ground(self, chunk: str, points: npt.NDArray[np.int32]) -> None:
         """Write a chunk's ground points, int32 (3, n), for the terrain model."""
         self._write(f"ground/{chunk}", points, _POINTS, -(2**31), None)

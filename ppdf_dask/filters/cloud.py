@@ -139,7 +139,9 @@ def to_grid(metres: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     return micro
 
 
-def cloud_from_grid(x: npt.NDArray[np.int64], y: npt.NDArray[np.int64], z: npt.NDArray[np.int64]) -> Cloud:
+def cloud_from_grid(
+    x: npt.NDArray[np.int64], y: npt.NDArray[np.int64], z: npt.NDArray[np.int64], fixed: Bools | None = None
+) -> Cloud:
     """Make a fully known cloud of absolute millimetres."""
     if len(x) == 0:
         empty = np.empty(0, np.int32)
@@ -152,7 +154,9 @@ def cloud_from_grid(x: npt.NDArray[np.int64], y: npt.NDArray[np.int64], z: npt.N
                 f"{name} reaches {far / MM:.0f} m from the cloud's own origin, more than {LIMIT / MM:.0f} m; "
                 "remove the stray points or use a survey run, which isolates them"
             )
-    return Cloud((x - ox).astype(np.int32), (y - oy).astype(np.int32), z.astype(np.int32), (ox, oy), len(x))
+    return Cloud(
+        (x - ox).astype(np.int32), (y - oy).astype(np.int32), z.astype(np.int32), (ox, oy), len(x), None, fixed
+    )
 
 
 def density(cloud: Cloud) -> Density:

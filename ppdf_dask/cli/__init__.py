@@ -1,0 +1,78 @@
+"""The command line: thin, it parses, calls the library and turns errors into a sentence and an exit code."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from ppdf_dask import __version__
+from ppdf_dask.errors import PpdfError
+
+COMMANDS = {
+    "demo": ("jobs", "a small synthetic survey with known ground: the whole job, the errors"),
+    "scan": ("jobs", "what is there: tiles, CRS, units, density, overlaps, problems"),
+    "plan": ("jobs", "what a run will take: chunks, points, memory, disk"),
+    "run": ("jobs", "classify a survey; on an existing run it resumes"),
+    "classify": ("jobs", "one tile in memory, no cluster"),
+    "evaluate": ("studies", "compare a classified tile with its reference"),
+}
+"""Command name to the module of this package that holds it, loaded when it is called, and what it does."""
+
+
+class Lazy(click.Group):
+    """A group that imports a command's module only when the command is asked for."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands without importing them: `--help` must answer at once."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names in the order of use."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import and return a command."""
+        if cmd_name not in COMMANDS:
+            return None
+        from importlib import import_module
+
+        module = import_module(f"ppdf_dask.cli.{COMMANDS[cmd_name][0]}")
+        command: click.Command = getattr(module, cmd_name)
+        return command
+
+
+@click.group(cls=Lazy, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, prog_name="ppdf-dask")
+def group() -> None:
+    r"""Tell ground from vegetation and buildings in airborne LiDAR surveys of any size.
+
+    \b
+    ppdf-dask demo                         a small synthetic survey, the whole job, the errors
+    ppdf-dask scan tiles/                  what is there
+    ppdf-dask plan tiles/                  what a run will take
+    ppdf-dask run  tiles/ --out RUN        classified tiles, terrain model; run again to resume
+    ppdf-dask classify in.laz out.laz      one tile, no cluster
+    """
+
+
+def main() -> None:
+    """Run the command line; the console script."""
+    try:
+        group(standalone_mode=False)
+    except click.exceptions.Abort:
+        sys.exit(130)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.exceptions.Exit as stop:
+        sys.exit(stop.exit_code)
+    except KeyboardInterrupt:
+        click.echo("stopped; the same command goes on where it stopped", err=True)
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(141)
+    except PpdfError as error:
+        click.echo(f"ppdf-dask: {error}", err=True)
+        sys.exit(error.exit_code)

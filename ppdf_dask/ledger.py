@@ -1,0 +1,109 @@
+"""What is done, with which fingerprint: the truth that survives every process.
+
+The ledger lives in the store (`RunStore.put_record`). Each record carries the fingerprint of all that shaped it, so a
+record counts only while inputs, parameters and code are the same: that is how a run resumes, and why nothing is mixed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ppdf_dask.errors import ResumeError
+from ppdf_dask.store import RunStore
+
+Stage = Literal["tile", "classify", "merge", "dtm", "cog"]
+STAGES: tuple[Stage, ...] = ("tile", "classify", "merge", "dtm", "cog")
+
+
+def digest(value: Any) -> str:
+    """Return 16 hexadecimal digits of a JSON value, the same on any machine.
+
+    Examples
+    --------
+    >>> digest({"b": 1, "a": [2]}) == digest({"a": [2], "b": 1})
+    True
+    """
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """The ledger of one run.
+
+    Parameters
+    ----------
+    store : RunStore
+        Where it is kept.
+    """
+
+    store: RunStore
+
+    def begin(self, facts: dict[str, Any], *, overwrite: bool = False, accept_changes: bool = False) -> bool:
+        """Open the ledger for a run described by `facts`.
+
+        Parameters
+        ----------
+        facts : dict
+            Inputs, parameters and versions as plain JSON, one level of named values.
+        overwrite : bool
+            Erase an existing run first.
+        accept_changes : bool
+            Go on with changed facts; records with another fingerprint are redone.
+
+        Returns
+        -------
+        bool
+            True when an earlier run goes on.
+
+        Raises
+        ------
+        ResumeError
+            When the facts differ from those of the existing run; old and new value stand side by side.
+        """
+        if overwrite and self.store.exists():
+            self.store.erase()
+        resumes = self.store.exists()
+        if resumes:
+            old = self.store.attributes().get("facts", {})
+            changed = differences(old, facts)
+            if changed and not accept_changes:
+                table = "\n".join(f"  {name}: was {was}, now {now}" for name, was, now in changed[:12])
+                more = f"\n  and {len(changed) - 12} more" if len(changed) > 12 else ""
+                raise ResumeError(
+                    f"{self.store.url} belongs to a run with other inputs or settings:\n{table}{more}\n"
+                    "Give --accept-changes to recompute what they touch, --overwrite to start anew, or another --out."
+                )
+        self.store.create({"facts": facts})
+        return resumes
+
+    def publish(self, stage: Stage, ident: str, fingerprint: str, record: dict[str, Any]) -> None:
+        """Write the record that says this piece of work is done; always the last write of a task."""
+        self.store.put_record(stage, ident, {"fingerprint": fingerprint, **record})
+
+    def done(self, stage: Stage, fingerprint: str) -> dict[str, dict[str, Any]]:
+        """Return the records of a stage that were made with this fingerprint."""
+        return {
+            ident: record for ident, record in self.store.records(stage) if record.get("fingerprint") == fingerprint
+        }
+
+
+def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:
+    """List what differs between two nested dicts as ``(dotted name, old, new)``.
+
+    Examples
+    --------
+    >>> differences({"dtm": {"resolution": 1.0}, "v": 1}, {"dtm": {"resolution": 2.0}, "v": 1})
+    [('dtm.resolution', 1.0, 2.0)]
+    """
+    found: list[tuple[str, Any, Any]] = []
+    for name in sorted(old.keys() | new.keys()):
+        a, b = old.get(name), new.get(name)
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += differences(a, b, f"{prefix}{name}.")
+        elif a != b:
+            found.append((prefix + name, a, b))
+    return found

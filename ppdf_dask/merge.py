@@ -1,0 +1,184 @@
+"""Masks back into the user's own tiles: every point, in its order, only `classification` changed.
+
+The file is decoded again in full, each point asks the mask of its chunk, and the result goes to a temporary name,
+is decoded once more and compared, and only then gets its own name.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+from laspy.errors import LaspyException
+
+from ppdf_dask.classes import new_classes
+from ppdf_dask.errors import StoreError, TileError
+from ppdf_dask.reader import BATCH, Batch, Decoder
+from ppdf_dask.store import RunStore
+from ppdf_dask.tiler import TileJob, owners
+from ppdf_dask.tiles import shown
+
+Bools = npt.NDArray[np.bool_]
+GroundOf = Callable[[Batch], Bools]
+
+
+@dataclass(frozen=True)
+class MergeJob:
+    """What a worker needs to write one source file again.
+
+    Attributes
+    ----------
+    tile : TileJob
+        As the file was cut.
+    target : str
+        Path of the classified file.
+    """
+
+    tile: TileJob
+    target: str
+
+
+def write_tile(store: RunStore, job: MergeJob) -> dict[str, Any]:
+    """Write one classified tile of a run; see `rewrite`."""
+    masks = _Masks(store, job.tile)
+    record = rewrite(job.tile, Path(job.target), masks.ground)
+    masks.check_used_up()
+    return record
+
+
+def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
+    """Copy a file with new classes.
+
+    Parameters
+    ----------
+    job : TileJob
+        The source.
+    target : Path
+        The result; LAZ.
+    ground_of : callable
+        Gives for each batch, in file order, the mask of its points found ground.
+
+    Returns
+    -------
+    dict
+        ``points``, ``ground`` (points of the ground class), ``changed``, ``bytes`` and the ``classes`` histogram.
+
+    Raises
+    ------
+    TileError
+        The source is damaged or changed, or the written file does not read back as it was meant.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        meant = _copy(job, part, ground_of)
+        _verify(part, meant)
+        os.replace(part, target)
+    except (LaspyException, OSError) as error:
+        raise TileError(f"{shown(job.tile.path)} could not be written to {target}: {error}") from error
+    finally:
+        with suppress(FileNotFoundError):
+            part.unlink()
+    return {**meant.record(), "bytes": target.stat().st_size}
+
+
+class _Histogram:
+    """Counts and a running checksum of the classes, to compare what was meant with what was written."""
+
+    def __init__(self) -> None:
+        self.points, self.changed, self.crc = 0, 0, 0
+        self.classes = np.zeros(256, np.int64)
+
+    def add(self, classes: npt.NDArray[np.uint8]) -> None:
+        self.points += len(classes)
+        self.classes += np.bincount(classes, minlength=256)
+        self.crc = zlib.crc32(np.ascontiguousarray(classes).tobytes(), self.crc)
+
+    def record(self) -> dict[str, Any]:
+        histogram = {str(k): int(self.classes[k]) for k in np.flatnonzero(self.classes)}
+        return {"points": self.points, "changed": self.changed, "classes": histogram, "crc32": self.crc}
+
+
+def _copy(job: TileJob, part: Path, ground_of: GroundOf) -> _Histogram:
+    decoder, meant = Decoder.of(job.tile, job.unit_xy, job.unit_z, job.params.classes, job.params.returns), _Histogram()
+    job.tile.check_unchanged()
+    with laspy.open(job.tile.path, laz_backend=laspy.LazBackend.Lazrs) as source:
+        header = plain_header(source.header)
+        with laspy.open(part, "w", header=header, laz_backend=laspy.LazBackend.Lazrs, do_compress=True) as out:
+            for points in source.chunk_iterator(BATCH):
+                batch = decoder.measure(points.array, meant.points)
+                classes = new_classes(batch.classification, batch.eligible, ground_of(batch), job.params.classes)
+                meant.changed += int((classes != batch.classification).sum())
+                points.classification = classes
+                out.write_points(points)
+                meant.add(classes)
+            evlrs = [v for v in source.evlrs or [] if v.user_id != "copc"]
+            if evlrs:
+                out.write_evlrs(laspy.vlrs.vlrlist.VLRList(evlrs))
+    job.tile.check_unchanged()
+    if meant.points != job.tile.point_count:
+        raise TileError(f"{shown(job.tile.path)} holds {meant.points} points, its header says {job.tile.point_count}")
+    return meant
+
+
+def plain_header(header: laspy.LasHeader) -> laspy.LasHeader:
+    """Return the header for the result: the same but for the COPC index, which describes the old order of bytes."""
+    kept = [v for v in header.vlrs if v.user_id != "copc"]
+    header.vlrs = laspy.vlrs.vlrlist.VLRList(kept)
+    return header
+
+
+def _verify(part: Path, meant: _Histogram) -> None:
+    found = _Histogram()
+    only = laspy.DecompressionSelection.base() | laspy.DecompressionSelection.CLASSIFICATION
+    with laspy.open(part, laz_backend=laspy.LazBackend.Lazrs, decompression_selection=only) as reader:
+        for points in reader.chunk_iterator(BATCH):
+            found.add(np.asarray(points.classification, np.uint8))
+    if (found.points, found.crc) != (meant.points, meant.crc):
+        raise TileError(
+            f"{part} does not read back as written ({found.points} of {meant.points} points); "
+            "check the disk and run again"
+        )
+
+
+class _Masks:
+    """The masks of the chunks a file touches, each read once, walked through in file order."""
+
+    def __init__(self, store: RunStore, job: TileJob) -> None:
+        self._store, self._job = store, job
+        self._masks: dict[str, Bools] = {}
+        self._used: dict[str, int] = {}
+
+    def ground(self, batch: Batch) -> Bools:
+        found = np.zeros(batch.n, np.bool_)
+        seen = np.flatnonzero(batch.eligible)
+        for ix, iy, index in owners(self._job.grid, batch.x[seen], batch.y[seen]):
+            chunk = self._job.grid.chunk(ix, iy).id
+            if chunk not in self._masks:
+                self._masks[chunk] = self._store.read_classification(chunk).get(self._job.source, np.zeros(0, np.bool_))
+                self._used[chunk] = 0
+            begin = self._used[chunk]
+            self._used[chunk] = end = begin + len(index)
+            if end > len(self._masks[chunk]):
+                raise self._mismatch(chunk)
+            found[seen[index]] = self._masks[chunk][begin:end]
+        return found
+
+    def check_used_up(self) -> None:
+        for chunk, mask in self._masks.items():
+            if self._used[chunk] != len(mask):
+                raise self._mismatch(chunk)
+
+    def _mismatch(self, chunk: str) -> StoreError:
+        return StoreError(
+            f"the classification of chunk {chunk} has another number of points of {shown(self._job.tile.path)} than "
+            "the file; was the file changed during the run? Run again with --overwrite"
+        )

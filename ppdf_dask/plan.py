@@ -1,0 +1,318 @@
+"""Survey and parameters to a plan: chunks, points, memory, disk; from headers alone, no point is touched."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ppdf_dask import filters
+from ppdf_dask.errors import PlanError
+from ppdf_dask.filters.cloud import Density
+from ppdf_dask.grid import MM, ChunkGrid, Rect
+from ppdf_dask.params import RunParams
+from ppdf_dask.survey import Survey, Tile
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from ppdf_dask.events import Event
+    from ppdf_dask.result import Result
+
+WORKER_MB = 350.0
+"""Resident size of a worker that has imported everything and compiled its kernels, measured."""
+
+TILE_BYTES = 110.0
+"""Bytes per point of the batch in flight while a tile is decoded or written, measured."""
+
+BATCH_POINTS = 1_000_000
+"""Points decoded at a time."""
+
+STORED_BYTES = 5.5
+"""Bytes per stored point in Zarr, between the 4 and 6.3 measured on clouds of 0.3 to 15 points/m2."""
+
+CHUNK_SIZES = (50, 100, 150, 200, 250, 300, 400, 500, 750, 1000, 1250, 1500, 2000, 2500, 3000, 4000, 5000, 7500, 10_000)
+"""Edges in metres the planner chooses from."""
+
+FEW_POINTS = 500_000
+"""A chunk below this is not worth cutting further to feed more workers."""
+
+
+@dataclass(frozen=True)
+class ChunkEstimate:
+    """What the headers let expect of one chunk."""
+
+    id: str
+    core: Rect
+    points: float
+    loaded: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will do and take; `run` does it.
+
+    Attributes
+    ----------
+    survey : Survey
+        The tiles.
+    params : RunParams
+        What shapes the result.
+    out : Path
+        Folder of the run.
+    grid : ChunkGrid
+        The chunks.
+    buffer : int
+        First guess of the buffer, mm.
+    memory : float
+        Bytes a worker may use.
+    """
+
+    survey: Survey
+    params: RunParams
+    out: Path
+    grid: ChunkGrid
+    buffer: int
+    memory: float
+
+    @property
+    def stored_buffer(self) -> int:
+        """Width of the buffer stored with each chunk, mm: none when it is wider than a chunk (neighbours serve)."""
+        return self.buffer if self.buffer <= self.grid.size else 0
+
+    @cached_property
+    def chunks(self) -> list[ChunkEstimate]:
+        """The chunks, densest first, with their expected numbers of eligible points."""
+        return _estimate(self.survey, self.grid, self.buffer, self.params.returns == "last")
+
+    @property
+    def task_mb(self) -> float:
+        """Expected peak of the largest task, MB, the worker itself included."""
+        loaded = max((c.loaded for c in self.chunks), default=0.0)
+        per_point = 24.0 + filters.of(self.params.filter).bytes_per_point
+        return WORKER_MB + max(loaded * per_point, BATCH_POINTS * TILE_BYTES) / 1e6
+
+    @property
+    def disk_mb(self) -> dict[str, float]:
+        """Expected size of the store, the LAZ files and the raster, MB."""
+        stored = sum(c.points * _share(self.grid.size, self.stored_buffer) for c in self.chunks) * STORED_BYTES
+        pixels = _area_mm2(self.survey) / (self.params.dtm.resolution * MM) ** 2
+        return {
+            "run.zarr": round((stored + pixels * 5) / 1e6, 1),
+            "laz": round(sum(t.size for t in self.survey.tiles) / 1e6, 1),
+            "dtm.tif": round(pixels * 5 / 1e6, 1),
+        }
+
+    @cached_property
+    def density(self) -> Density:
+        """Expected density of the eligible points; the run itself counts it."""
+        points = sum(_eligible(t, self.params.returns == "last") for t in self.survey.tiles)
+        area = _area_mm2(self.survey) / MM**2
+        return Density(round(points), max(1, round(area / 25)))
+
+    def check(self) -> None:
+        """Refuse what cannot work.
+
+        Raises
+        ------
+        PlanError
+            A task would exceed the memory of a worker, or the disk would run full; with both numbers.
+        """
+        if self.task_mb * 1e6 > self.memory:
+            raise PlanError(
+                f"the largest chunk needs about {self.task_mb:.0f} MB but a worker has {self.memory / 1e6:.0f} MB; "
+                f"give a smaller --chunk-size than {self.grid.size / MM:g} m or fewer workers with more memory each"
+            )
+        need, place = sum(self.disk_mb.values()) * 1e6, self.out
+        while not place.exists():
+            place = place.parent
+        free = shutil.disk_usage(place).free
+        if need > free:
+            raise PlanError(
+                f"the run needs about {need / 1e6:.0f} MB but {place} has {free / 1e6:.0f} MB free; "
+                "free some space or choose another --out"
+            )
+
+    def run(
+        self,
+        client: Client,
+        *,
+        on_event: Callable[[Event], None] | None = None,
+        overwrite: bool = False,
+        accept_changes: bool = False,
+    ) -> Result:
+        """Run the plan on a cluster; an interrupted run goes on where it stopped.
+
+        Parameters
+        ----------
+        client : distributed.Client
+            Any client; the library never makes a cluster.
+        on_event : callable, optional
+            Receives each `Event`.
+        overwrite, accept_changes : bool
+            Start anew; go on with changed inputs or parameters, redoing what they touch.
+
+        Returns
+        -------
+        Result
+            The finished run.
+
+        Raises
+        ------
+        PlanError, ResumeError
+            Before any work is done.
+        PartialRunError
+            Some chunks or tiles failed; the others are done.
+        """
+        from ppdf_dask.runner import run
+
+        return run(self, client, on_event=on_event, overwrite=overwrite, accept_changes=accept_changes)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the plan as plain JSON."""
+        return {
+            "tiles": len(self.survey.tiles),
+            "points": self.survey.point_count,
+            "chunks": len(self.chunks),
+            "chunk_size_m": self.grid.size / MM,
+            "buffer_m": self.buffer / MM,
+            "points_per_chunk_max": round(max((c.points for c in self.chunks), default=0)),
+            "points_loaded_max": round(max((c.loaded for c in self.chunks), default=0)),
+            "density_per_m2": round(self.density.per_m2, 3),
+            "task_mb": round(self.task_mb),
+            "disk_mb": self.disk_mb,
+            "params": self.params.as_dict(),
+        }
+
+    def __repr__(self) -> str:
+        f = self.facts()
+        name = filters.of(self.params.filter).name
+        return "\n".join(
+            (
+                f"Plan: {f['tiles']} tiles, {f['points']:,} points -> {f['chunks']} chunks of {f['chunk_size_m']:g} m",
+                f"  filter       {name} ({type(self.params.filter).__name__}), {self.params.returns} returns, "
+                f"about {f['density_per_m2']:g} eligible points/m2",
+                f"  buffer       {f['buffer_m']:g} m at first, up to {self.params.chunks.max_buffer:g} m where needed",
+                f"  largest task {f['points_per_chunk_max']:,} points ({f['points_loaded_max']:,} with buffer), "
+                f"about {f['task_mb']:,} MB of {self.memory / 1e6:,.0f} MB",
+                "  disk         " + ", ".join(f"{k} {v:,.0f} MB" for k, v in f["disk_mb"].items()),
+                f"  raster       {self.params.dtm.resolution:g} m pixels",
+                f"  output       {self.out}",
+            )
+        )
+
+    def _repr_html_(self) -> str:
+        from ppdf_dask.maps import plan_html
+
+        return plan_html(self)
+
+
+def plan(
+    survey: Survey,
+    params: RunParams | None = None,
+    *,
+    out: str | Path = "ppdf-run",
+    memory: float = 4e9,
+) -> Plan:
+    """Plan a run.
+
+    Parameters
+    ----------
+    survey : Survey
+        From `scan`.
+    params : RunParams, optional
+        Default: the robust profile of PPDF, a 1 m raster, chunks chosen from the densities.
+    out : str or Path
+        Folder of the run, made when it starts.
+    memory : float
+        Bytes each worker may use; default 4 GB.
+
+    Returns
+    -------
+    Plan
+        Cheap to make and to look at; nothing is read but what `scan` read.
+    """
+    params = params or RunParams()
+    chosen = filters.of(params.filter)
+    if params.chunks.buffer is None:
+        area = _area_mm2(survey) / MM**2
+        points = sum(_eligible(t, params.returns == "last") for t in survey.tiles)
+        estimate = Density(round(points), max(1, round(area / 25)))
+        buffer = chosen.required_buffer(chosen.resolve(params.filter, estimate))
+    else:
+        buffer = params.chunks.buffer
+        if not chosen.exact and buffer < chosen.required_buffer(params.filter):
+            raise PlanError(
+                f"--buffer {buffer:g} m is less than the reach of filter {chosen.name}, "
+                f"{chosen.required_buffer(params.filter):g} m; leave it out or widen it"
+            )
+    width = math.ceil(buffer * MM)
+    if params.chunks.chunk_size is not None:
+        grid = ChunkGrid.from_metres(params.chunks.chunk_size)
+    else:
+        grid = _choose(survey, params, width, memory)
+    return Plan(survey, params, Path(out), grid, width, memory)
+
+
+def _eligible(tile: Tile, last: bool) -> float:
+    """Points a tile offers: last and only returns are as many as the pulses, which the header counts."""
+    pulses = getattr(tile, "first_returns", 0)
+    return float(pulses if last and 0 < pulses < tile.point_count else tile.point_count)
+
+
+def _extent(tile: Tile) -> int:
+    return 0 if tile.bounds is None else tile.bounds.width * tile.bounds.height
+
+
+def _area_mm2(survey: Survey) -> int:
+    return sum(_extent(t) for t in survey.tiles)
+
+
+def _share(size: int, buffer: int) -> float:
+    return ((size + 2 * buffer) / size) ** 2
+
+
+def _estimate(survey: Survey, grid: ChunkGrid, buffer: int, last: bool) -> list[ChunkEstimate]:
+    """Spread each tile's points evenly over its bounds, and again over the bounds grown by the buffer."""
+    points: dict[tuple[int, int], float] = {}
+    loaded: dict[tuple[int, int], float] = {}
+    for tile in survey.tiles:
+        b = tile.bounds
+        if b is None:
+            continue
+        per_area = _eligible(tile, last) / max(b.width * b.height, 1)
+        for chunk in grid.over(b.grow(buffer)):
+            key = (chunk.ix, chunk.iy)
+            inside = _area(b, chunk.core)
+            if inside:
+                points[key] = points.get(key, 0.0) + per_area * inside
+            loaded[key] = loaded.get(key, 0.0) + per_area * _area(b, chunk.core.grow(buffer))
+    found = [
+        ChunkEstimate(grid.chunk(*key).id, grid.chunk(*key).core, n, loaded[key]) for key, n in sorted(points.items())
+    ]
+    return sorted(found, key=lambda c: (-c.loaded, c.id))
+
+
+def _area(a: Rect, b: Rect) -> int:
+    return max(0, min(a.x1, b.x1) - max(a.x0, b.x0)) * max(0, min(a.y1, b.y1) - max(a.y0, b.y0))
+
+
+def _choose(survey: Survey, params: RunParams, buffer: int, memory: float) -> ChunkGrid:
+    """Take the largest edge whose densest chunk fits the memory and leaves some chunks to share out."""
+    per_point = 24.0 + filters.of(params.filter).bytes_per_point
+    fits = (0.6 * memory - WORKER_MB * 1e6) / per_point
+    last = params.returns == "last"
+    total = sum(_eligible(t, last) for t in survey.tiles)
+    enough = max(total / 8, FEW_POINTS)
+    densest = max((_eligible(t, last) / max(_extent(t), 1) for t in survey.tiles), default=0.0)
+    chosen = CHUNK_SIZES[0]
+    for size in CHUNK_SIZES:
+        edge = size * MM
+        if densest * edge**2 > enough or densest * (edge + 2 * buffer) ** 2 > fits:
+            break
+        chosen = size
+    return ChunkGrid.from_metres(chosen)

@@ -1,0 +1,81 @@
+"""One tile in memory: no store, no cluster, the same result as a run on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ppdf_dask import filters
+from ppdf_dask.errors import SurveyError
+from ppdf_dask.filters.cloud import cloud_from_grid, density
+from ppdf_dask.grid import ChunkGrid
+from ppdf_dask.merge import rewrite
+from ppdf_dask.params import RunParams
+from ppdf_dask.reader import Batch
+from ppdf_dask.survey import Survey
+from ppdf_dask.tiler import TileJob
+
+
+def classify_tile(survey: Survey, target: str | Path, params: RunParams | None = None) -> dict[str, Any]:
+    """Classify one tile.
+
+    Parameters
+    ----------
+    survey : Survey
+        From `scan` of a single file.
+    target : str or Path
+        The classified file; written under a temporary name, verified, then renamed.
+    params : RunParams, optional
+        Default: the robust profile of PPDF.
+
+    Returns
+    -------
+    dict
+        ``points``, ``ground``, ``changed``, ``bytes`` and ``classes`` of the written file.
+
+    Raises
+    ------
+    SurveyError
+        When the survey is not one tile, or the target is the source.
+    TileError
+        When the tile is damaged.
+    """
+    if len(survey.tiles) != 1:
+        raise SurveyError(f"classify takes one tile, not {len(survey.tiles)}; use `ppdf-dask run` for a survey")
+    tile, target = survey.tiles[0], Path(target)
+    if target.exists() and target.samefile(tile.path):
+        raise SurveyError(f"{target} is the input itself; give another name for the output")
+    params = params or RunParams()
+    job = TileJob("s_000000", tile, survey.unit_xy, survey.unit_z, params, ChunkGrid.from_metres(1000.0), 0)
+    ground = _ground(job)
+    record = rewrite(job, target, _Cursor(ground).take)
+    return record | {"ground": int(ground.sum())}
+
+
+def _ground(job: TileJob) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    parts = [
+        np.stack([values[batch.eligible] for values in (batch.x, batch.y, batch.z, batch.fixed.astype(np.int64))])
+        for batch in job.batches()
+    ]
+    points = np.concatenate(parts, axis=1) if parts else np.empty((4, 0), np.int64)
+    fixed = points[3].astype(np.bool_) if job.params.classes.mode == "refine" else None
+    cloud = cloud_from_grid(points[0], points[1], points[2], fixed)
+    chosen = filters.of(job.params.filter)
+    found = chosen.classify(cloud, chosen.resolve(job.params.filter, density(cloud))).ground
+    return found if cloud.fixed is None else found | cloud.fixed
+
+
+class _Cursor:
+    """Hands out a mask of eligible points batch by batch."""
+
+    def __init__(self, ground: np.ndarray[Any, np.dtype[np.bool_]]) -> None:
+        self._ground, self._used = ground, 0
+
+    def take(self, batch: Batch) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        found = np.zeros(batch.n, np.bool_)
+        count = int(batch.eligible.sum())
+        found[batch.eligible] = self._ground[self._used : self._used + count]
+        self._used += count
+        return found
