@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from ppdf_dask import filters
 from ppdf_dask.errors import ParameterError
 from ppdf_dask.filters import pcom, voxel
+from ppdf_dask.filters._clusters import window_clusters
 from ppdf_dask.filters.cloud import Density, cloud_from_grid
 from ppdf_dask.filters.pcom import PcomParams
 from ppdf_dask.filters.voxel import VoxelParams
@@ -175,6 +176,24 @@ def test_agrees_with_the_oracle(points, params):
 
 
 @EXAMPLES
+@given(st.integers(0, 2**32 - 1), st.integers(1, 25), st.integers(4, 13), st.integers(0, 2))
+def test_clusters_of_every_window_agree_with_flooding(seed, m, tolerance, half):
+    edge = 4  # few places, so that many distances equal the tolerance
+    rng = np.random.default_rng(seed)
+    ix, iy = (v.astype(np.int64) for v in np.divmod(np.sort(rng.choice(64, m, replace=False)), 8))
+    layer = rng.integers(-3, 3, m)
+    cx, cy = ix * edge + rng.integers(0, edge, m), iy * edge + rng.integers(0, edge, m)
+    name = window_clusters(ix, iy, layer, cx, cy, (tolerance - 1) // edge + 1, tolerance, half)
+    for k in range(-6, 6):
+        window = [i for i in range(m) if abs(layer[i] - k) <= half]
+        found = defaultdict(set)
+        for i in window:
+            found[name[i, k - layer[i] + half]].add(i)
+        expected = clusters(window, lambda a, b: (cx[a] - cx[b]) ** 2 + (cy[a] - cy[b]) ** 2 <= tolerance**2)
+        assert sorted(map(sorted, found.values())) == sorted(map(sorted, expected))
+
+
+@EXAMPLES
 @given(clouds(), st.sampled_from([VoxelParams(), PcomParams(min_area=0.05)]), st.randoms(use_true_random=False))
 def test_order_and_place_do_not_matter(points, params, random):
     shuffled = list(range(len(points)))
@@ -202,12 +221,11 @@ def test_the_voxel_filter_shows_no_seam(points, x0, width):
 
 
 def test_a_column_cut_by_the_known_area_is_unproven():
-    x = np.arange(0, 2000, 10)
-    known = Rect(100, -1000, 1900, 1000)
-    inside = (x >= 100) & (x < 1900)
-    cloud = cloud_from_grid(x[inside], 0 * x[inside], 0 * x[inside])
-    unproven = voxel.classify(replace(cloud, known=known), VoxelParams()).unproven
-    assert unproven.tolist() == [v < 500 or v >= 1500 for v in x[inside].tolist()]
+    for low, high, partial in ((100, 1900, True), (0, 2000, False)):
+        x = np.arange(low, high, 10)
+        cloud = replace(cloud_from_grid(x, 0 * x, 0 * x), known=Rect(low, -1000, high, 1000))
+        unproven = voxel.classify(cloud, VoxelParams()).unproven
+        assert unproven.tolist() == [partial and (v < 500 or v >= 1500) for v in x.tolist()]
 
 
 # ---------------------------------------------------------------- by hand
