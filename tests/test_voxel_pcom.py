@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from ppdf_dask import filters
 from ppdf_dask.errors import ParameterError
 from ppdf_dask.filters import pcom, voxel
-from ppdf_dask.filters._clusters import window_clusters
+from ppdf_dask.filters._clusters import above_neighbours, touching, window_clusters
 from ppdf_dask.filters.cloud import Density, cloud_from_grid
 from ppdf_dask.filters.pcom import PcomParams
 from ppdf_dask.filters.voxel import VoxelParams
@@ -191,6 +191,24 @@ def test_clusters_of_every_window_agree_with_flooding(seed, m, tolerance, half):
             found[name[i, k - layer[i] + half]].add(i)
         expected = clusters(window, lambda a, b: (cx[a] - cx[b]) ** 2 + (cy[a] - cy[b]) ** 2 <= tolerance**2)
         assert sorted(map(sorted, found.values())) == sorted(map(sorted, expected))
+
+
+@EXAMPLES
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(0, 3))
+def test_local_medians_and_contacts_agree_with_their_definition(seed, m, excess):
+    edge, radius = 4, 12
+    rng = np.random.default_rng(seed)
+    ix, iy = (v.astype(np.int64) for v in np.divmod(np.sort(rng.choice(64, m, replace=False)), 8))
+    cx, cy, cz = ix * edge + rng.integers(0, edge, m), iy * edge + rng.integers(0, edge, m), rng.integers(0, 8, m)
+    kept, layer = rng.uniform(size=m) < 0.7, cz // edge
+    out = above_neighbours(ix, iy, cx, cy, cz, kept, 3, radius, excess)
+    contacts = touching(ix, iy, layer, kept)
+    for i in range(m):
+        others = [j for j in range(m) if j != i and kept[j]]
+        near = [cz[j] for j in others if (cx[i] - cx[j]) ** 2 + (cy[i] - cy[j]) ** 2 <= radius**2]
+        assert out[i] == bool(kept[i] and near and cz[i] - np.median(near) > excess)
+        eight = [j for j in others if max(abs(ix[i] - ix[j]), abs(iy[i] - iy[j]), abs(layer[i] - layer[j])) == 1]
+        assert contacts[i] == len(eight)
 
 
 @EXAMPLES
