@@ -335,6 +335,14 @@ def _laszip(draft: _Draft, offset: int, record_length: int, count: int) -> Laszi
         raise Reject("count", f"claims to have no points but holds {room} bytes of them")
     if not variable and chunks > max(1, -(-count // chunk_size)):
         raise Reject("count", f"claims {count} points but has {chunks} chunks of {chunk_size}: there are more points")
+    listed = _read_table(draft, offset, record, table)
+    if variable and sum(points for points, _ in listed) != count:
+        raise Reject("count", f"claims {count} points; its chunks hold {sum(points for points, _ in listed)}")
+    length = sum(length for _, length in listed)
+    if length > room:
+        raise Reject("chunk-table", f"has a broken chunk table at byte {table}: its chunks are longer than the points")
+    if length < room:
+        draft.warnings.append(("chunk-table", f"has a chunk table that accounts for {length} of {room} bytes"))
     return Laszip(record, compressor == 3, None if variable else chunk_size, layers, table, chunks)
 
 
@@ -353,6 +361,21 @@ def _chunk_table(draft: _Draft, offset: int, record_length: int) -> tuple[int, i
     if version != 0 or chunks > (table - offset - 8) // record_length + 1:
         raise Reject("chunk-table", f"has a broken chunk table at byte {table} (version {version}, {chunks} chunks)")
     return table, chunks
+
+
+def _read_table(draft: _Draft, offset: int, record: bytes, table: int) -> list[tuple[int, int]]:
+    """Return points (as far as the table knows them) and bytes of each chunk; the number of chunks is checked."""
+    import lazrs
+
+    draft.file.seek(offset)
+    try:
+        listed: list[tuple[int, int]] = lazrs.read_chunk_table(draft.file, lazrs.LazVlr(record))
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    # A panic of the decoder is not an Exception.
+    except BaseException as error:
+        raise Reject("chunk-table", f"has a chunk table at byte {table} that cannot be read: {error}") from None
+    return listed
 
 
 def _check_scales(scales: tuple[float, ...], offsets: tuple[float, ...]) -> None:
