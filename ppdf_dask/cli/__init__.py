@@ -46,7 +46,7 @@ class Lazy(click.Group):
 @click.group(cls=Lazy, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="ppdf-dask")
 def group() -> None:
-    r"""Tell ground from vegetation and buildings in airborne LiDAR surveys of any size.
+    """Tell ground from vegetation and buildings in airborne LiDAR surveys of any size.
 
     \b
     ppdf-dask demo                         a small synthetic survey, the whole job, the errors

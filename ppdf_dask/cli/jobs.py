@@ -40,7 +40,7 @@ def _cluster(function: Any) -> Any:
 @survey_options
 @json_option
 def scan(tiles: tuple[str, ...], as_json: bool, **options: Any) -> None:
-    r"""Say what is there, from headers alone: tiles, CRS, units, density, overlaps, problems.
+    """Say what is there, from headers alone: tiles, CRS, units, density, overlaps, problems.
 
     \b
     ppdf-dask scan tiles/
@@ -57,7 +57,7 @@ def scan(tiles: tuple[str, ...], as_json: bool, **options: Any) -> None:
 @run_options
 @json_option
 def plan(tiles: tuple[str, ...], as_json: bool, **options: Any) -> None:
-    r"""Say what a run will take: chunks, points, memory, disk. Touches no points.
+    """Say what a run will take: chunks, points, memory, disk. Touches no points.
 
     \b
     ppdf-dask plan tiles/
@@ -81,7 +81,7 @@ def plan(tiles: tuple[str, ...], as_json: bool, **options: Any) -> None:
 @click.option("--overwrite", is_flag=True, help="Start anew where a run exists.")
 @click.option("--accept-changes", is_flag=True, help="Go on with changed inputs or parameters; redo what they touch.")
 def run(tiles: tuple[str, ...], out: Path, overwrite: bool, accept_changes: bool, **options: Any) -> None:
-    r"""Classify a survey: tiles in, classified tiles and a terrain model out. Run it again to resume.
+    """Classify a survey: tiles in, classified tiles and a terrain model out. Run it again to resume.
 
     \b
     ppdf-dask run tiles/ --out RUN
@@ -113,7 +113,7 @@ def run(tiles: tuple[str, ...], out: Path, overwrite: bool, accept_changes: bool
 )
 @_cluster
 def demo(out: Path, **cluster: Any) -> None:
-    r"""Make a small synthetic survey with known ground, run everything, print the errors.
+    """Make a small synthetic survey with known ground, run everything, print the errors.
 
     \b
     ppdf-dask demo
@@ -138,7 +138,7 @@ def demo(out: Path, **cluster: Any) -> None:
 @survey_options
 @filter_options
 def classify(source: Path, target: Path, **options: Any) -> None:
-    r"""Classify one tile in memory: no store, no cluster, the same result as `run` on it.
+    """Classify one tile in memory: no store, no cluster, the same result as `run` on it.
 
     \b
     ppdf-dask classify in.laz out.laz

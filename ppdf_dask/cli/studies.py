@@ -14,7 +14,7 @@ import click
 @click.option("--score", metavar="EXPRESSION", help="Points that count, such as 'user_data==0'.")
 @click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
 def evaluate(reference: Path, classified: Path, score: str | None, as_json: bool) -> None:
-    r"""Compare a classified tile with its reference, point by point.
+    """Compare a classified tile with its reference, point by point.
 
     \b
     ppdf-dask evaluate reference.laz classified.laz
