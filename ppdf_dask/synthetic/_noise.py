@@ -17,7 +17,7 @@ _UNIT = 1.0 / 9007199254740992.0
 _HALF_UNIT = 1.0 / 4294967296.0
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def mixed(h: np.uint64) -> np.uint64:
     """Return the bits of `h` scrambled (the finaliser of SplitMix64, Steele et al. 2014)."""
     h = (h ^ (h >> np.uint64(30))) * _C
@@ -25,25 +25,25 @@ def mixed(h: np.uint64) -> np.uint64:
     return h ^ (h >> np.uint64(31))
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def cell_hash(ix: int | np.int64, iy: int | np.int64, salt: np.uint64) -> np.uint64:
     """Return 64 bits that depend on a lattice cell and a salt only."""
     return mixed(np.uint64(ix) * _A + np.uint64(iy) * _B + salt)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def following(h: np.uint64) -> np.uint64:
     """Return the next 64 bits of the sequence that starts at `h`."""
     return mixed(h + _A)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def unit(h: np.uint64) -> float:
     """Return the hash as a number in [0, 1)."""
     return np.float64(h >> np.uint64(11)) * _UNIT
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def bell(h: np.uint64) -> float:
     """Return a bell-shaped number of mean 0 and standard deviation 1 (four uniform ones added), within +-2 sqrt(3)."""
     g = mixed(h + _B)
@@ -52,7 +52,7 @@ def bell(h: np.uint64) -> float:
     return (total * _HALF_UNIT - 2.0) * 1.7320508075688772
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def _corner(ix: int | np.int64, iy: int | np.int64, salt: np.uint64, dx: float, dy: float) -> float:
     h = cell_hash(ix, iy, salt)
     gx = np.float64(h & _LOW) * _HALF_UNIT - 0.5

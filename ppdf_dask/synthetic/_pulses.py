@@ -266,10 +266,10 @@ def scan(
                 + (j + 0.9 * step_share(i, j, column, beam.columns)) * beam.spacing / beam.speed
             )
             for k in range(found):
+                h = following(h)
                 qx = px + np.int64(np.floor(lean * (zs[k] - zg) * 1000.0 + 0.5)) if kinds[k] != _GROUND else px
                 if qx < x0 or qx >= x1:
                     continue
-                h = following(h)
                 bright = 180.0 if kinds[k] == _GROUND else (260.0 if kinds[k] == _BUILDING else 140.0)
                 out.x[n], out.y[n], out.z[n] = qx, py, np.int32(np.floor(zs[k] * 1000.0 + 0.5))
                 out.return_number[n], out.number_of_returns[n] = k + 1, found
@@ -283,7 +283,7 @@ def scan(
     return n
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def step_share(i: int, j: int, column: int, columns: int) -> float:
     """Return how far the sweep has come at a column, 0 to 1."""
     return (column if j % 2 == 0 else columns - 1 - column) / columns

@@ -41,7 +41,7 @@ class SyntheticParams(Parameters):
     roughness : float
         Height of hummocks some tens of metres wide, m; finer forms are scaled with it.
     terrace_height : float
-        Height of the steps where slopes are terraced (about a third of the land), m; 0 for none.
+        Height of the steps where slopes are terraced (about a quarter of the land), m; 0 for none.
     scarp_height : float
         Height of the scarps with sharp edges that cross the land, m; 0 for none.
     water : {"none", "void", "returns"}

@@ -93,7 +93,7 @@ def _heights(x: NDArray[np.float64], y: NDArray[np.float64], r: Relief) -> NDArr
     return out
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def _ramp(u: float, radius: float) -> float:
     """Return max(u, 0) with its corner rounded by a parabola of half width `radius`."""
     if u <= -radius:
@@ -103,14 +103,14 @@ def _ramp(u: float, radius: float) -> float:
     return (u + radius) * (u + radius) / (4.0 * radius)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def _step(u: float) -> float:
     """Return a smooth step from 0 at u <= 0 to 1 at u >= 1."""
     u = min(1.0, max(0.0, u))
     return u * u * (3.0 - 2.0 * u)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True)
 def _from_axis(s: float, length: float) -> float:
     """Return the distance to the nearest valley axis; axes lie at multiples of twice `length`."""
     period = 2.0 * length
@@ -137,7 +137,7 @@ def height(x: float, y: float, r: Relief) -> tuple[float, bool]:
         z += scale * r.spurs * up * (_ramp(side - r.floor, r.rounding) - _ramp(side - (l2 - r.crest), r.rounding))
     z += 1.5 * r.gradient * l1 * up * noise(x / (3.7 * l1), y / (3.7 * l1), salt + np.uint64(2))
     if r.terrace > 0.0:
-        share = _step(8.0 * (noise(x / (1.1 * l1), y / (1.1 * l1), salt + np.uint64(3)) - 0.08) + 0.5)
+        share = _step(16.0 * (noise(x / (1.1 * l1), y / (1.1 * l1), salt + np.uint64(3)) - 0.06) + 0.5)
         if share > 0.0:
             q = z / r.terrace
             k = np.floor(q)

@@ -33,6 +33,7 @@ def write_survey(
     extent: tuple[float, float, float, float] = DEMO_EXTENT,
     tile_size: int = 200,
     classified: bool = False,
+    truth: bool = True,
     crs: str = "EPSG:25832",
 ) -> list[Path]:
     """Write a survey as LAZ 1.4 tiles of point format 6 into ``folder/tiles``, its truth into ``folder/truth``.
@@ -48,9 +49,11 @@ def write_survey(
     tile_size : int
         Edge of a tile in whole metres; tiles lie at its absolute multiples and are cut at the extent.
     classified : bool
-        False (default): the tiles are delivered as class 1, with labelled noise and water as 7, 18 and 9, and
-        ``folder/truth`` holds the same points with their true classes under the same names. True: the tiles hold
-        the true classes and there is no second folder.
+        False (default): the tiles are delivered as class 1, with labelled noise and water as 7, 18 and 9. True: the
+        tiles hold the true classes, and there is no second folder.
+    truth : bool
+        Whether ``folder/truth`` gets the same points in the same order with their true classes, under the same names;
+        default True. False saves half the time and disk of a large benchmark.
     crs : str
         Anything pyproj understands, for the headers.
 
@@ -66,8 +69,9 @@ def write_survey(
 
     Notes
     -----
-    Points go to the tile that contains the point, so that any two tile layouts hold the same set of points. Memory is
-    bounded by a band of pulses, whatever the extent and the tile size. Headers carry no clock.
+    Points go to the tile that contains the point, so that any two tile layouts hold the same set of points, and tiles
+    can be made by many workers, each with its tile's extent. Memory is bounded by a band of pulses, whatever the extent
+    and the tile size. Headers carry no clock.
 
     Examples
     --------
@@ -82,7 +86,7 @@ def write_survey(
         size = tile_size * MM
         name = f"x{rect.x0 // size * tile_size:06d}_y{rect.y0 // size * tile_size:06d}.laz"
         targets = [(Path(folder) / "tiles" / name, classified)]
-        if not classified:
+        if truth and not classified:
             targets.append((Path(folder) / "truth" / name, True))
         if write_tile(rect, params, targets, crs):
             written.append(targets[0][0])
