@@ -99,6 +99,18 @@ def test_the_circle_test_is_exact_and_a_tie_has_one_answer(points):
     assert got == (rest[top] > 0)
 
 
+@pytest.mark.parametrize("m", [2**20, 2**25])
+def test_a_miss_of_the_circle_by_one_part_in_a_quadrillion_is_seen(m):
+    """x² + y² of the fourth point differs by 1 from the others' m² or m² + 1; floating point cannot tell."""
+    on = [(m, 0), (0, m), (-m, 0)], [(m, 1), (-1, m), (-m, -1)]
+    off = [(1, -m), (-1, -m), (m, 1), (-m, 1)], [(0, -m), (m, 0), (-m, 0), (0, m)]
+    for circle, others in zip(on, off, strict=True):
+        for d in others:
+            values = [v for p in (*circle, d) for v in p]
+            assert abs(exact_in_circle(*circle, d)) == 2 * m * m + 2 * (circle[0][1]) ** 2
+            assert _delaunay.in_circle(*map(np.int64, values)) == (exact_in_circle(*circle, d) > 0)
+
+
 def shape(tin):
     v, t = tin.vertices, tin.triangles
     return {frozenset((*map(tuple, v[k[:3]].tolist()),)) for k in t}
@@ -212,7 +224,11 @@ def at_once(points, block, limits, resolution=1000):
     arrays = tin.vertices, tin.triangles, first, 2 * resolution
     dtm.heights(*arrays, np.array(limits), box, z, box.copy())
     dtm.distances(*arrays, limits[-1], box, d, box.copy())
-    return tuple((a / 1000).astype(np.float32).tobytes() for a in (z[0], d, z[-1]))
+    return z[0], d, z[-1]
+
+
+def as_float32(arrays):
+    return tuple((a / 1000).astype(np.float32).tobytes() for a in arrays)
 
 
 @given(
@@ -234,7 +250,9 @@ def test_the_result_depends_on_the_ground_only(points, margin, window, most, kno
         block = DtmGrid(1000).block(-1, 0)
         extent = Rect(-60_000, -60_000, 90_000, 90_000) if known else None
         got = rasterize_block(block, loader(points[order], seen), params, extent=extent, first_margin=margin)
-        assert as_bytes(got) == at_once(points, block, [8000, 20_000])
+        whole, again = (at_once(p, block, [8000, 20_000]) for p in (points, points[order]))
+    assert as_bytes(got) == as_float32(whole)
+    assert [a.tobytes() for a in again] == [a.tobytes() for a in whole], "and this in the last bit of a double"
     reach = block.rect.grow(2 * 20_000 + 2)
     assert all(reach.contains(rect) for rect in seen)
     assert got.margin <= 2 * 20_000 + 2
@@ -250,8 +268,40 @@ def test_far_points_decide_and_are_asked_for():
             points = np.array([*near, far])
             alone = rasterize_block(block, loader(points[:3]), params, first_margin=0)
             got = rasterize_block(block, loader(points), params, first_margin=0)
-            assert as_bytes(got)[:2] == at_once(points, block, [60_000])[:2]
+            assert as_bytes(got)[:2] == as_float32(at_once(points, block, [60_000]))[:2]
             assert got.height.tobytes() != alone.height.tobytes()
+
+
+def test_the_far_side_of_a_circle_is_looked_at():
+    """The last point lies just inside the circle of the others and nearly 2 `max_edge` from the pixels they hold."""
+    radius, middle = 7990, (30_900, 12_000)
+    arc = [
+        [round(middle[0] + radius * math.cos(a)), round(middle[1] + radius * math.sin(a)), 0]
+        for a in (2.65, math.pi, 3.63)
+    ]
+    far = [middle[0] + radius - 30, middle[1], 0]
+    with sizes():
+        block = DtmGrid(1000).block(-1, 0)
+        alone, got = (
+            rasterize_block(block, loader(np.array(p)), DtmParams(max_edge=8.0), first_margin=0)
+            for p in (arc, [*arc, far])
+        )
+    assert np.isfinite(alone.height).any()
+    assert np.isnan(got.height).all()
+
+
+def test_the_nearest_point_is_looked_for_even_where_all_heights_are_proven():
+    """A round hole up to the block's edge: its circle lies in the block, but a point outside is nearer than its rim."""
+    gx, gy = np.meshgrid(np.arange(50, 23_600, 500), np.arange(-5270, 30_000, 500))
+    xy = np.column_stack([gx.ravel(), gy.ravel()])
+    xy = xy[np.hypot(xy[:, 0] - 19_200, xy[:, 1] - 12_000) > 4750]
+    rim = [[23_550, 12_000 - 1908], [23_550, 12_000 + 1908], [14_450, 12_000]]
+    points = np.column_stack([np.vstack([xy, rim, [[24_300, 12_000]]]), np.zeros(len(xy) + 4, int)])
+    with sizes():
+        block = DtmGrid(1000).block(-1, 0)
+        got = rasterize_block(block, loader(points), DtmParams(max_edge=20.0), first_margin=0)
+        assert as_bytes(got)[:2] == as_float32(at_once(points, block, [20_000]))[:2]
+    assert got.distance[SIDE - 12, -1] == np.float32(math.hypot(0.8, 0.5))
 
 
 def test_a_plane_comes_back_and_the_place_of_a_pixel_is_its_centre():
