@@ -1,0 +1,88 @@
+"""CSF through its library: silent, repeatable, with clear errors."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from classic_clouds import cloud_of
+
+from ppdf_dask.errors import ParameterError, PpdfError
+from ppdf_dask.filters import csf
+from ppdf_dask.filters.csf import PAPER, PAPER_SMOOTH, CsfParams, classify
+
+pytest.importorskip("CSF", reason="the extra csf is not installed")
+
+
+def scene(seed=1):
+    """Flat land with a house, and a terrace 4 m high beyond a steep bank."""
+    rng = np.random.default_rng(seed)
+    xy = rng.integers(0, 40_000, (5000, 2))
+    bank = np.clip(xy[:, 0] - 20_000, 0, 4000)
+    house = (abs(xy[:, 0] - 10_000) < 4000) & (abs(xy[:, 1] - 20_000) < 4000)
+    return np.column_stack([xy, bank + np.where(house, 5000, 0)]), house
+
+
+def test_a_house_is_removed_and_the_land_kept():
+    pts, house = scene()
+    ground = classify(cloud_of(pts), CsfParams()).ground
+    assert not ground[house].any()
+    # The cloth spans the walls' foot and the bank; everywhere else it lies on the land.
+    far = (pts[:, 0] < 18_000) & ~((abs(pts[:, 0] - 10_000) < 6000) & (abs(pts[:, 1] - 20_000) < 6000))
+    assert ground[far].all()
+
+
+def test_the_order_of_the_points_does_not_matter_nor_does_a_second_run():
+    pts, _ = scene()
+    ground = classify(cloud_of(pts), CsfParams()).ground
+    order = np.random.default_rng(2).permutation(len(pts))
+    assert (classify(cloud_of(pts[order]), CsfParams()).ground == ground[order]).all()
+    moved = pts + np.array([512_345_678, 5_400_000_123, -70_000])
+    assert (classify(cloud_of(moved), CsfParams()).ground == ground).all()
+
+
+def test_parameters_reach_the_library():
+    pts, _ = scene()
+    counts = {
+        name: int(classify(cloud_of(pts), params).ground.sum())
+        for name, params in {
+            "soft": CsfParams(rigidness=1),
+            "stiff": CsfParams(),
+            "smooth": PAPER_SMOOTH,
+            "rough": PAPER,
+            "narrow": CsfParams(threshold=0.01),
+            "one step": CsfParams(iterations=1, slope_smooth=False),
+        }.items()
+    }
+    assert counts["smooth"] >= counts["rough"]
+    assert counts["narrow"] < counts["stiff"]
+    assert counts["one step"] < counts["stiff"]
+    assert counts["soft"] > counts["stiff"]
+
+
+def test_nothing_is_printed_even_from_c():
+    code = (
+        "import numpy as np; from ppdf_dask.filters import classify_ground;"
+        "classify_ground(np.random.default_rng(0).uniform(0, 9, (500, 3)), 'csf')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, env=os.environ)
+    assert done.stdout == b""
+    assert done.stderr == b""
+
+
+def test_errors_say_what_to_do(monkeypatch):
+    with pytest.raises(ParameterError, match=r"rigidness = 2\.5 is not a whole number"):
+        CsfParams(rigidness=2.5)  # type: ignore[arg-type]
+    wide = cloud_of([(200_000 * k, 200_000 * k, 0) for k in range(9)])
+    with pytest.raises(ParameterError, match=r"--chunk-size"):
+        classify(wide, CsfParams(resolution=0.05))
+    pts, _ = scene()
+    monkeypatch.setattr(csf, "CHILD", csf.CHILD.with_name("absent.py"))
+    with pytest.raises(PpdfError, match=r"5000 points ended with code 2 .*--chunk-size"):
+        classify(cloud_of(pts), CsfParams())
+    monkeypatch.setattr(csf.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(PpdfError, match=r"pip install 'ppdf-dask\[csf\]'"):
+        classify(cloud_of(pts), CsfParams())
