@@ -154,14 +154,17 @@ def scan(
     repeated = sorted({a for a, b in pairwise(files) if a == b})
 
     headers: dict[str, Header] = {}
+    frames: dict[str, Frame] = {}
     for path in names:
         try:
-            headers[path] = read_header(path)
+            header = read_header(path)
         except Reject as reject:
             problems.append(Problem(path, reject.code, reject.message, True))
-        else:
-            problems += [Problem(path, code, message, False) for code, message in headers[path].warnings]
-    frames = {path: _frame(h, assumed) for path, h in headers.items()}
+            continue
+        problems += [Problem(path, code, message, False) for code, message in header.warnings]
+        frames[path] = _frame(header, assumed)
+        # The records' own bytes would be most of the memory of a large survey.
+        headers[path] = replace(header, wkt=None, geo_keys=None)
     for path, frame in frames.items():
         fault = frame.fault
         if fault is not None and not (units is not None and fault[0] in ("crs-unreadable", "units")):

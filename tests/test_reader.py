@@ -140,6 +140,12 @@ def test_grid_axis_is_exact(scale, offset, unit, values):
             assert found == nearest or (near_tie and abs(found - nearest) == 1)
 
 
+def test_a_half_micrometre_does_not_lift_a_half_millimetre():
+    """Tenths of micrometres: 499.5 goes to 499 and so to 0 mm, which is the nearest one."""
+    values = np.array([4994, 4995, 4996, 5000, 5005, -4995, -5005], np.int32)
+    assert GridAxis.of(1e-7, 0.0, 1.0).to_mm(values).tolist() == [0, 0, 1, 1, 1, 0, -1]
+
+
 @settings(max_examples=100, deadline=None)
 @given(
     st.sampled_from([0.01, 0.001, 0.00025, 0.0005, 1e-5]),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import shutil
 import xml.etree.ElementTree as ElementTree
 
@@ -172,11 +173,12 @@ def test_nothing_to_scan(tmp_path):
             scan(paths)
 
 
-def test_survey_survives_json(tmp_path):
+def test_survey_survives_json_and_pickle(tmp_path):
     for k in range(3):
         write(tmp_path / f"{k}.laz", points(50, k), crs="EPSG:2263+6360")
     survey = scan(tmp_path)
     assert Survey.from_dict(json.loads(json.dumps(survey.as_dict()))) == survey
+    assert pickle.loads(pickle.dumps(survey)) == survey
 
 
 # --- headers that lie ----------------------------------------------------------------------------------------------
