@@ -129,7 +129,7 @@ def height(x: float, y: float, r: Relief) -> tuple[float, bool]:
     bend = r.meander * noise(x / (1.9 * l1), y / (1.9 * l1), salt)
     axis = _from_axis(along + 3.0 * l1 * bend, l1)
     rise = _ramp(axis - r.floor, r.rounding) - _ramp(axis - (l1 - r.crest), r.rounding)
-    up = min(1.0, axis / l1)
+    up = _step(axis / l1)
     scale = r.gradient / np.sqrt(1.0 + r.spurs * r.spurs)
     z = scale * rise
     if r.spurs > 0.0:
