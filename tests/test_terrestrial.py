@@ -39,7 +39,7 @@ def test_each_method_is_tuned_on_one_plot_and_scored_on_others(small_grid):
         asked.append((kind, seed))
         return plot(kind, seed)
 
-    table = thesis_table(noted, (1, 2), tuning_seed=0)
+    table = thesis_table((1, 2), tuning_seed=0, plot=noted)
     assert asked == [(kind, seed) for kind in KINDS for seed in (0, 1, 2)]
     flat = table.row("flat", "PCOM")
     assert (flat.scores.a, flat.scores.b) == (0, 0)  # the stump is dropped, nothing else
@@ -99,7 +99,7 @@ def test_the_picture_shows_what_pcom_removes():
 @pytest.mark.parametrize("seeds", [(), (0, 1)])
 def test_the_tuning_plot_is_not_scored(seeds):
     with pytest.raises(ParameterError, match="tuning plot"):
-        thesis_table(plot, seeds, tuning_seed=0)
+        thesis_table(seeds, tuning_seed=0, plot=plot)
 
 
 def test_an_unknown_method_is_refused():

@@ -20,17 +20,18 @@ from ppdf_dask.filters.cloud import Bools, Cloud, cloud_from_xyz
 from ppdf_dask.filters.pcom import PcomParams
 from ppdf_dask.filters.voxel import VoxelParams
 from ppdf_dask.metrics import Scores, mean_std, pooled
+from ppdf_dask.synthetic.terrestrial import Kind, terrestrial_plot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Plot = Callable[[str, int], tuple[npt.NDArray[np.float64], Bools]]
+Plot = Callable[[Kind, int], tuple[npt.NDArray[np.float64], Bools]]
 """``plot(kind, seed)``: points (n, 3) in metres and which of them are ground."""
 
-KINDS = ("flat", "slope", "complex")
-RESOLUTIONS = (0.06, 0.1, 0.16, 0.24, 0.36)
-MIN_AREAS = (0.25, 0.5, 1.0, 2.0)
-TOLERANCES = (1.5, 2.5, 3.5)
+KINDS: tuple[Kind, ...] = ("flat", "slope", "complex")
+RESOLUTIONS = (0.04, 0.06, 0.1, 0.16, 0.24)
+MIN_AREAS = (0.1, 0.25, 0.5, 1.0)
+TOLERANCES = (1.5, 2.5, 3.5, 5.0)
 
 COLUMNS = {"P": "precision", "T.I": "type_i", "T.II": "type_ii", "T.E.": "total", "kappa": "kappa"}
 """The columns of the thesis' Table 1 and the names of the rates."""
@@ -55,7 +56,7 @@ class Tuned:
         With these, all scored plots of the kind pooled.
     """
 
-    kind: str
+    kind: Kind
     method: str
     params: VoxelParams
     scores: Scores
@@ -79,12 +80,12 @@ class ThesisTable:
     tuning_seed: int
     seeds: tuple[int, ...]
 
-    def row(self, kind: str, method: str) -> Tuned:
+    def row(self, kind: Kind, method: str) -> Tuned:
         """Return one method on one kind of plot."""
         return next(r for r in self.rows if (r.kind, r.method) == (kind, method))
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def kinds(self) -> tuple[Kind, ...]:
         """The kinds of plots, in order."""
         return tuple(dict.fromkeys(r.kind for r in self.rows))
 
@@ -165,7 +166,7 @@ def candidates(method: str) -> list[VoxelParams]:
     Examples
     --------
     >>> len(candidates("3D Forest")), len(candidates("PCOM"))
-    (5, 60)
+    (5, 80)
     """
     if method not in METHODS:
         raise ParameterError(f"method = {method!r} is unknown; choose one of {', '.join(METHODS)}")
@@ -184,18 +185,19 @@ def classify(cloud: Cloud, params: VoxelParams) -> Bools:
     return ground
 
 
-def thesis_table(plot: Plot, seeds: Sequence[int] = (1, 2, 3), *, tuning_seed: int = 0) -> ThesisTable:
+def thesis_table(
+    seeds: Sequence[int] = (1, 2, 3), *, tuning_seed: int = 0, plot: Plot = terrestrial_plot
+) -> ThesisTable:
     """Compare PCOM with 3D Forest's voxel filter on plots with known ground.
 
     Parameters
     ----------
-    plot : callable
-        ``plot(kind, seed)``: points (n, 3) and ground mask, for each kind in `KINDS`; see
-        `ppdf_dask.synthetic.terrestrial_plot`.
     seeds : sequence of int
         Plots to score, pooled per kind.
     tuning_seed : int
         Plot to choose the parameters on; not one of `seeds`, so that no method is scored on what it was tuned on.
+    plot : callable
+        ``plot(kind, seed)``: points (n, 3) and ground mask, for each kind in `KINDS`; default: the synthetic plots.
 
     Returns
     -------
