@@ -54,7 +54,7 @@ MAX_POINTS = 3_000_000
 """A window with more points is cut in four: 100 bytes per point are needed."""
 
 Load = Callable[[Rect], NDArray[Any]]
-"""Gives the ground points inside a rectangle: integers, mm, absolute, (n, 3), in any order."""
+"""Gives at least the ground points inside a rectangle: integers, mm, absolute, (n, 3), in any order."""
 
 
 @dataclass(frozen=True, order=True)
@@ -226,7 +226,8 @@ def rasterize_block(
         The block; see `DtmGrid`.
     load : callable
         ``load(rect)`` gives all ground points with ``x0 <= x < x1`` and ``y0 <= y < y1`` as integers, mm, (n, 3), in
-        any order; it is called with rectangles in and around the block, up to 2 `max_edge` away.
+        any order, others too if that is easier; it is called with rectangles in and around the block, up to
+        2 `max_edge` away.
     params : DtmParams
         Resolution and limits, metres.
     extent : Rect, optional
@@ -267,13 +268,13 @@ def rasterize_block(
     while todo:
         window = todo.pop()
         loaded = window.rect.grow(min(first_margin, 2 * limits[-1]))
-        cloud = load(loaded)
+        tin = _Tin(window.rect, limits[-1], first_margin)
+        cloud = tin.localise(load(loaded), loaded)
         side = max(window.r1 - window.r0, window.c1 - window.c0)
         if len(cloud) > MAX_POINTS and side > 1:
             todo += _windows(block, resolution, -(-side // 2), window)
             continue
-        tin = _Tin(window.rect, limits[-1], first_margin)
-        tin.insert(cloud, loaded)
+        tin.insert(cloud)
         z, d, loaded = _prove(tin, window, load, loaded, (resolution, limits, extent))
         layers[:, window.r0 : window.r1, window.c0 : window.c1] = z / (MM * unit_z)
         distance[window.r0 : window.r1, window.c0 : window.c1] = d / MM
@@ -319,13 +320,17 @@ class _Tin:
     def arrays(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         return self._mesh.vertices, self._mesh.triangles
 
-    def insert(self, points: NDArray[Any], inside: Rect) -> None:
-        """Insert those of the absolute points that lie inside a rectangle."""
+    def localise(self, points: NDArray[Any], inside: Rect) -> NDArray[np.int32]:
+        """Return those of the absolute points that lie inside a rectangle, from the window's centre."""
         points = np.asarray(points)
         x, y = points[:, 0], points[:, 1]
         keep = (x >= inside.x0) & (x < inside.x1) & (y >= inside.y0) & (y < inside.y1)
         local = np.empty((int(np.count_nonzero(keep)), 3), dtype=np.int32)
         local[:, 0], local[:, 1], local[:, 2] = x[keep] - self.x, y[keep] - self.y, points[keep, 2]
+        return local
+
+    def insert(self, local: NDArray[np.int32]) -> None:
+        """Insert points counted from the window's centre."""
         self.points += len(local)
         self._mesh.insert(local)
 
@@ -355,13 +360,13 @@ def _prove(
         d = np.full(shape, np.inf)
         need = tin.box(window.rect)
         heights(*tin.arrays, first, 2 * resolution, np.array(limits, np.int64), known, z, need)
-        distances(*tin.arrays, first, 2 * resolution, limits[-1], known, d, need)
-        wanted = tin.rect(need)
-        if loaded.contains(wanted):
-            return z, d, loaded
-        wider = loaded.union(wanted)
+        if loaded.contains(tin.rect(need)):
+            distances(*tin.arrays, first, 2 * resolution, limits[-1], known, d, need)
+            if loaded.contains(tin.rect(need)):
+                return z, d, loaded
+        wider = loaded.union(tin.rect(need))
         for strip in _difference(wider, loaded):
-            tin.insert(load(strip), strip)
+            tin.insert(tin.localise(load(strip), strip))
         loaded = wider
 
 

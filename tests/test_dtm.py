@@ -250,6 +250,9 @@ def test_the_result_depends_on_the_ground_only(points, margin, window, most, kno
         block = DtmGrid(1000).block(-1, 0)
         extent = Rect(-60_000, -60_000, 90_000, 90_000) if known else None
         got = rasterize_block(block, loader(points[order], seen), params, extent=extent, first_margin=margin)
+        generous = rasterize_block(block, lambda _: points, params, first_margin=margin)
+        assert as_bytes(generous) == as_bytes(got), "whole chunks, as the store gives them"
+        assert (generous.points, generous.margin) == (got.points, got.margin) or known
         whole, again = (at_once(p, block, [8000, 20_000]) for p in (points, points[order]))
     assert as_bytes(got) == as_float32(whole)
     assert [a.tobytes() for a in again] == [a.tobytes() for a in whole], "and this in the last bit of a double"
