@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from ppdf_dask.filters.ppdf.compiled import leaf
 from ppdf_dask.filters.ppdf.hashing import mix
 
 SIDE = 8
@@ -25,7 +26,7 @@ STEEPEST = 32.163437477526264
 """tan(80 degrees) squared: steeper local planes give no height."""
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def fill_table(keys: Any, table: Any) -> None:
     """Enter block keys into an open-addressing table of -1s whose length is a power of two."""
     mask = np.uint64(len(table) - 1)
@@ -36,7 +37,7 @@ def fill_table(keys: Any, table: Any) -> None:
         table[at] = b
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _find(keys: Any, table: Any, i: int, j: int) -> int:
     key = (np.int64(i) << 32) + j
     mask = np.uint64(len(table) - 1)
@@ -48,7 +49,7 @@ def _find(keys: Any, table: Any, i: int, j: int) -> int:
     return -1
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def neighbours_of(keys: Any, table: Any, near: Any) -> None:
     """Write the 3 x 3 blocks around each block, -1 where there is none."""
     for b in range(len(keys)):
@@ -57,98 +58,119 @@ def neighbours_of(keys: Any, table: Any, near: Any) -> None:
             near[b, k] = _find(keys, table, i + k // 3 - 1, j + k % 3 - 1)
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _before(d: int, p: int, e: int, q: int, x: Any, y: Any, z: Any) -> bool:
     """Tell whether point p at squared distance d comes before q at e: by distance, z, x, y."""
-    if q < 0 or d != e:
-        return q < 0 or d < e
-    if z[p] != z[q]:
-        return bool(z[p] < z[q])
-    if x[p] != x[q]:
-        return bool(x[p] < x[q])
-    return bool(y[p] < y[q])
+    if d != e:
+        first = d < e
+    elif z[p] != z[q]:
+        first = z[p] < z[q]
+    elif x[p] != x[q]:
+        first = x[p] < x[q]
+    else:
+        first = y[p] < y[q]
+    return bool(first)
 
 
-@njit(nogil=True, cache=True)
+@leaf
+def _slot(dx: int, dy: int, nearest: bool) -> int:
+    """Return the quadrant of a difference other than (0, 0), always 0 for the nearest of all."""
+    if nearest or (dx > 0 and dy >= 0):
+        slot = 0
+    elif dx <= 0 and dy > 0:
+        slot = 1
+    elif dx < 0:
+        slot = 2
+    else:
+        slot = 3
+    return slot
+
+
+@leaf
 def _offer(
     p: int, o: int, x: Any, y: Any, z: Any, state: Any, limit: int, nearest: bool, best: Any, shade: Any
 ) -> None:
     """Enter point p among the neighbours of o: `best` and `shade` hold (index, squared distance) per slot."""
     dx, dy = np.int64(x[p]) - x[o], np.int64(y[p]) - y[o]
     d = dx * dx + dy * dy
-    if d == 0 or d > limit:
-        return
-    slot = 0
-    if not nearest:
-        if dx > 0 and dy >= 0:
-            slot = 0
-        elif dx <= 0 and dy > 0:
-            slot = 1
-        elif dx < 0:
-            slot = 2
-        else:
-            slot = 3
-    if state[p] & UNPROVEN and _before(d, p, shade[slot, 1], shade[slot, 0], x, y, z):
-        shade[slot, 0], shade[slot, 1] = p, d
-    if not state[p] & GROUND:
-        return
-    last = 3 if nearest else slot
-    if not _before(d, p, best[last, 1], best[last, 0], x, y, z):
-        return
-    while last > slot and _before(d, p, best[last - 1, 1], best[last - 1, 0], x, y, z):
-        best[last, 0], best[last, 1] = best[last - 1, 0], best[last - 1, 1]
-        last -= 1
-    best[last, 0], best[last, 1] = p, d
+    if 0 < d <= limit:
+        slot = _slot(dx, dy, nearest)
+        if state[p] & UNPROVEN and _before(d, p, shade[slot, 1], shade[slot, 0], x, y, z):
+            shade[slot, 0], shade[slot, 1] = p, d
+        last = 3 if nearest else slot
+        if state[p] & GROUND and _before(d, p, best[last, 1], best[last, 0], x, y, z):
+            while last > slot and _before(d, p, best[last - 1, 1], best[last - 1, 0], x, y, z):
+                best[last, 0], best[last, 1] = best[last - 1, 0], best[last - 1, 1]
+                last -= 1
+            best[last, 0], best[last, 1] = p, d
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _still_open(best: Any, to: Any, reached: int, reach: int, nearest: bool) -> int:
     """Return a bit per quadrant that may still hold a nearer point.
 
     Unseen points lie at least `to` (right, top, left, bottom) + `reached` away along an axis.
     """
-    if nearest:
-        bound = reached + min(min(to[0], to[1]), min(to[2], to[3]))
-        done = bound > reach or (best[3, 0] >= 0 and best[3, 1] < bound * bound)
-        return 0 if done else 15
     bits = 0
     for q in range(4):
-        bound = reached + min(to[q], to[(q + 1) % 4])
-        if bound <= reach and (best[q, 0] < 0 or best[q, 1] >= bound * bound):
+        bound = reached + min(to[q], to[(q + 1) & 3])
+        if bound <= reach and best[3 if nearest else q, 1] >= bound * bound:
             bits |= 1 << q
     return bits
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _quadrants_at(di: int, dj: int) -> int:
     """Return a bit per quadrant that a cell `di` columns and `dj` rows away can hold points of."""
     right, left, top, bottom = di >= 0, di <= 0, dj >= 0, dj <= 0
     return (right and top) * 1 + (left and top) * 2 + (left and bottom) * 4 + (right and bottom) * 8
 
 
-@njit(nogil=True, cache=True)
+@leaf
+def _use(p: int, block: int, x: Any, y: Any, grid: Any, masks: Any) -> None:
+    """Note that the bucket of point p holds a ground or unproven point."""
+    i, j = (x[p] - grid[1]) // grid[0], (y[p] - grid[2]) // grid[0]
+    masks[block, i & 7] |= np.uint8(1 << (j & 7))
+
+
+@leaf
+def _window(block: int, near: Any, masks: Any, window: Any) -> None:
+    """Write which buckets of the 3 x 3 blocks are in use: a word per column, bit r for row r, 24 each."""
+    for i in range(3 * SIDE):
+        window[i] = 0
+        for k in range(3):
+            b = near[block, 3 * (i // SIDE) + k]
+            if b >= 0:
+                window[i] |= np.int64(masks[b, i % SIDE]) << (SIDE * k)
+
+
+@leaf
 def _search(o: int, block: int, x: Any, y: Any, z: Any, state: Any, grid: Any, starts: Any, keys: Any, table: Any,
-            near: Any, active: Any, reach: int, nearest: bool, best: Any, shade: Any, to: Any) -> None:  # fmt: skip
+            near: Any, masks: Any, window: Any, reach: int, nearest: bool, best: Any,
+            shade: Any, to: Any) -> None:  # fmt: skip
     """Find the ground points that carry the plane at o, and the first unproven point of each slot."""
     g, left, bottom = grid[0], grid[1], grid[2]
     limit = reach * reach
-    best[:, 0] = -1
-    shade[:, 0] = -1
+    best[:, 0], best[:, 1] = -1, limit + 1
+    shade[:, 0], shade[:, 1] = -1, limit + 1
     gi, gj = (x[o] - left) // g, (y[o] - bottom) // g
     fx, fy = (x[o] - left) - gi * g, (y[o] - bottom) - gj * g
     to[0], to[1], to[2], to[3] = g - fx, g - fy, fx + 1, fy + 1
-    li, lj = gi % SIDE, gj % SIDE
+    li, lj = gi & (SIDE - 1), gj & (SIDE - 1)
     open_ = 15
     for ring in range(SIDE + 1):
         for di in range(-ring, ring + 1):
-            step = 1 if abs(di) == ring else 2 * ring
-            for dj in range(-ring, ring + 1, max(1, step)):
-                if not _quadrants_at(di, dj) & open_:
+            full = abs(di) == ring
+            bits = ((2 << 2 * ring) - 1 if full else 1 | 1 << 2 * ring) << (SIDE + lj - ring)
+            bits &= window[SIDE + li + di]
+            if bits == 0:
+                continue
+            for dj in range(-ring, ring + 1, 1 if full else 2 * ring):
+                row = SIDE + lj + dj
+                if not bits >> row & 1 or not _quadrants_at(di, dj) & open_:
                     continue
-                b = near[block, 3 * (((li + di) >> 3) + 1) + ((lj + dj) >> 3) + 1]
-                if b < 0 or active[b] == 0:
-                    continue
-                bucket = b * SIDE * SIDE + ((li + di) & 7) * SIDE + ((lj + dj) & 7)
+                b = near[block, 3 * ((SIDE + li + di) >> 3) + (row >> 3)]
+                bucket = b * SIDE * SIDE + ((li + di) & 7) * SIDE + (row & 7)
                 for p in range(starts[bucket], starts[bucket + 1]):
                     if state[p]:
                         _offer(p, o, x, y, z, state, limit, nearest, best, shade)
@@ -161,28 +183,34 @@ def _search(o: int, block: int, x: Any, y: Any, z: Any, state: Any, grid: Any, s
     ring = 1
     while open_ != 0:
         for ci in range(-ring, ring + 1):
-            step = 1 if abs(ci) == ring else 2 * ring
-            for cj in range(-ring, ring + 1, step):
+            for cj in range(-ring, ring + 1, 1 if abs(ci) == ring else 2 * ring):
                 if not _quadrants_at(ci, cj) & open_:
                     continue
                 b = near[block, 3 * ci + cj + 4] if ring == 1 else _find(keys, table, bi + ci, bj + cj)
-                if b < 0 or active[b] == 0:
+                if b < 0:
                     continue
-                for k in range(SIDE * SIDE):
-                    di, dj = ci * SIDE + k // SIDE - li, cj * SIDE + k % SIDE - lj
-                    if (abs(di) <= SIDE and abs(dj) <= SIDE) or not _quadrants_at(di, dj) & open_:
+                for i in range(SIDE):
+                    if masks[b, i] == 0:
                         continue
-                    bucket = b * SIDE * SIDE + k
-                    for p in range(starts[bucket], starts[bucket + 1]):
-                        if state[p]:
-                            _offer(p, o, x, y, z, state, limit, nearest, best, shade)
+                    for j in range(SIDE):
+                        di, dj = ci * SIDE + i - li, cj * SIDE + j - lj
+                        if (
+                            not masks[b, i] >> j & 1
+                            or (abs(di) <= SIDE and abs(dj) <= SIDE)
+                            or not _quadrants_at(di, dj) & open_
+                        ):
+                            continue
+                        bucket = (b * SIDE + i) * SIDE + j
+                        for p in range(starts[bucket], starts[bucket + 1]):
+                            if state[p]:
+                                _offer(p, o, x, y, z, state, limit, nearest, best, shade)
         open_ = _still_open(best, to, ring * wide, reach, nearest)
         ring += 1
 
 
-@njit(nogil=True, cache=True)
-def _accepts(o: int, x: Any, y: Any, z: Any, best: Any, tolerance: float, fewest: int) -> bool:
-    """Tell whether o lies near the plane through its neighbours (slots in order; empty ones skipped)."""
+@leaf
+def _misfit(o: int, x: Any, y: Any, z: Any, best: Any) -> float:
+    """Return the distance of o from the plane through its neighbours (slots in order; empty ones skipped)."""
     n, mx, my, mz = 0, 0.0, 0.0, 0.0
     weight, height = 0.0, 0.0
     for s in range(4):
@@ -196,99 +224,87 @@ def _accepts(o: int, x: Any, y: Any, z: Any, best: Any, tolerance: float, fewest
             mz += dz
             weight += w
             height += w * dz
-    if n < max(1, fewest):
-        return False
-    level = height / weight
-    if n < 3:
-        return abs(level) < tolerance
-    mx, my, mz = mx / n, my / n, mz / n
-    sxx, sxy, syy, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0
-    for s in range(4):
-        p = best[s, 0]
-        if p >= 0:
-            dx, dy = (np.int64(x[p]) - x[o]) - mx, (np.int64(y[p]) - y[o]) - my
-            dz = (np.int64(z[p]) - z[o]) - mz
-            sxx += dx * dx
-            sxy += dx * dy
-            syy += dy * dy
-            sxz += dx * dz
-            syz += dy * dz
-    det = sxx * syy - sxy * sxy
-    largest = 0.5 * (sxx + syy + math.sqrt((sxx - syy) * (sxx - syy) + 4.0 * sxy * sxy))
-    if det < FLATTEST * largest * largest:
-        return abs(level) < tolerance
-    a = (sxz * syy - syz * sxy) / det
-    b = (syz * sxx - sxz * sxy) / det
-    steepness = a * a + b * b
-    if steepness > STEEPEST:
-        return abs(level) < tolerance
-    return abs((a * mx + b * my - mz) / math.sqrt(1.0 + steepness)) < tolerance
+    away = height / weight
+    if n >= 3:
+        mx, my, mz = mx / n, my / n, mz / n
+        sxx, sxy, syy, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0
+        for s in range(4):
+            p = best[s, 0]
+            if p >= 0:
+                dx, dy = (np.int64(x[p]) - x[o]) - mx, (np.int64(y[p]) - y[o]) - my
+                dz = (np.int64(z[p]) - z[o]) - mz
+                sxx += dx * dx
+                sxy += dx * dy
+                syy += dy * dy
+                sxz += dx * dz
+                syz += dy * dz
+        det = sxx * syy - sxy * sxy
+        largest = 0.5 * (sxx + syy + math.sqrt((sxx - syy) * (sxx - syy) + 4.0 * sxy * sxy))
+        if det >= FLATTEST * largest * largest:
+            a = (sxz * syy - syz * sxy) / det
+            b = (syz * sxx - sxz * sxy) / det
+            steepness = a * a + b * b
+            if steepness <= STEEPEST:
+                away = (a * mx + b * my - mz) / math.sqrt(1.0 + steepness)
+    return abs(away)
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _leaves(x: int, y: int, quadrants: int, d: int, reach: int, known: Any) -> bool:
     """Tell whether the disk of squared radius d around (x, y), cut to some quadrants, leaves the known area."""
+    away = False
     for side in range(4):
         # Right of quadrants 1 and 4, top of 1 and 2, left of 2 and 3, bottom of 3 and 4.
-        faces = 1 << side | 1 << (side + 3) % 4
-        if not faces & quadrants:
-            continue
-        gap = (known[2] - x, known[3] - y, x - known[0] + 1, y - known[1] + 1)[side]
-        if gap <= 0 or (gap <= reach and gap * gap <= d):
-            return True
-    return False
+        faces = 1 << side | 1 << ((side + 3) & 3)
+        at = x if side & 1 == 0 else y
+        gap = known[2 + side] - at if side < 2 else at - known[side - 2] + 1
+        away |= faces & quadrants != 0 and (gap <= 0 or (gap <= reach and gap * gap <= d))
+    return away
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _doubt(o: int, x: Any, y: Any, z: Any, best: Any, shade: Any, reach: int, nearest: bool, known: Any) -> bool:
     """Tell whether the neighbours of o could be others than those found."""
+    doubt = False
     for q in range(1 if nearest else 4):
         last = 3 if nearest else q
-        p, d = best[last, 0], best[last, 1]
+        p, d = best[last, 0], min(best[last, 1], reach * reach)
         if shade[q, 0] >= 0 and not (p >= 0 and _before(d, p, shade[q, 1], shade[q, 0], x, y, z)):
-            return True
-        if _leaves(x[o], y[o], 15 if nearest else 1 << q, d if p >= 0 else reach * reach, reach, known):
-            return True
-    return False
+            doubt = True
+        doubt |= _leaves(x[o], y[o], 15 if nearest else 1 << q, d, reach, known)
+    return doubt
 
 
-@njit(nogil=True, cache=True)
-def _radius(best: Any, reach: int, nearest: bool) -> int:
+@leaf
+def _radius(best: Any, reach: int) -> int:
     """Return a bound of the distance beyond which nothing can change the test, mm."""
-    far = 0
-    for s in range(4):
-        if best[s, 0] < 0:
-            return reach
-        far = max(far, best[s, 1])
+    far = max(max(best[0, 1], best[1, 1]), max(best[2, 1], best[3, 1]))
     return min(reach, int(math.sqrt(far)) + 1)
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _block_touched(block: int, reach: int, wide: int, when: int, keys: Any, table: Any, near: Any, stamps: Any,
                    changed: Any, n_changed: int) -> bool:  # fmt: skip
     """Tell whether a block that may hold points within `reach` of this one changed in pass `when`."""
     w = (reach + wide - 1) // wide
+    i, j = keys[block] >> 32, keys[block] & 0xFFFFFFFF
+    touched = False
     if w <= 1:
-        touched = False
         for k in range(9):
             touched |= near[block, k] >= 0 and stamps[near[block, k]] == when
-        return touched
-    i, j = keys[block] >> 32, keys[block] & 0xFFFFFFFF
-    if n_changed < (2 * w + 1) * (2 * w + 1):
+    elif n_changed < (2 * w + 1) * (2 * w + 1):
         for k in range(n_changed):
             key = keys[changed[k]]
-            if abs((key >> 32) - i) <= w and abs((key & 0xFFFFFFFF) - j) <= w:
-                return True
-        return False
-    for di in range(-w, w + 1):
-        for dj in range(-w, w + 1):
-            b = _find(keys, table, i + di, j + dj)
-            if b >= 0 and stamps[b] == when:
-                return True
-    return False
+            touched |= abs((key >> 32) - i) <= w and abs((key & 0xFFFFFFFF) - j) <= w
+    else:
+        for di in range(-w, w + 1):
+            for dj in range(-w, w + 1):
+                b = _find(keys, table, i + di, j + dj)
+                touched |= b >= 0 and stamps[b] == when
+    return bool(touched)
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _point_touched(o: int, block: int, radius: int, x: Any, y: Any, grid: Any, near: Any, when: int, stamps: Any,
                    block_stamps: Any) -> bool:  # fmt: skip
     """Tell whether something changed in pass `when` within `radius` of o; may say yes too often, never no."""
@@ -296,21 +312,19 @@ def _point_touched(o: int, block: int, radius: int, x: Any, y: Any, grid: Any, n
     i0, i1, j0, j1 = (u - radius) // g, (u + radius) // g, (v - radius) // g, (v + radius) // g
     bi, bj = u // (SIDE * g), v // (SIDE * g)
     ci0, ci1, cj0, cj1 = (i0 >> 3) - bi, (i1 >> 3) - bi, (j0 >> 3) - bj, (j1 >> 3) - bj
-    if min(ci0, cj0) < -1 or max(ci1, cj1) > 1:
-        return True
-    for ci in range(ci0, ci1 + 1):
-        for cj in range(cj0, cj1 + 1):
-            b = near[block, 3 * ci + cj + 4]
-            if b < 0 or block_stamps[b] != when:
-                continue
-            for i in range(max(i0, (bi + ci) * SIDE), min(i1, (bi + ci) * SIDE + SIDE - 1) + 1):
-                for j in range(max(j0, (bj + cj) * SIDE), min(j1, (bj + cj) * SIDE + SIDE - 1) + 1):
-                    if stamps[b * SIDE * SIDE + (i & 7) * SIDE + (j & 7)] == when:
-                        return True
-    return False
+    touched = min(ci0, cj0) < -1 or max(ci1, cj1) > 1
+    if not touched:
+        for ci in range(ci0, ci1 + 1):
+            for cj in range(cj0, cj1 + 1):
+                b = near[block, 3 * ci + cj + 4]
+                if b >= 0 and block_stamps[b] == when:
+                    for i in range(max(i0, (bi + ci) * SIDE), min(i1, (bi + ci) * SIDE + SIDE - 1) + 1):
+                        for j in range(max(j0, (bj + cj) * SIDE), min(j1, (bj + cj) * SIDE + SIDE - 1) + 1):
+                            touched |= stamps[(b * SIDE + (i & 7)) * SIDE + (j & 7)] == when
+    return bool(touched)
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _next(state: int, accepted: bool, doubtful: bool) -> int:
     """Return the state after a test.
 
@@ -358,14 +372,16 @@ def grow(x: Any, y: Any, z: Any, state: Any, grid: Any, starts: Any, keys: Any, 
         Number of passes, the last one without a change counted; -1 when `most_passes` did not suffice.
     """
     m, wide = len(keys), SIDE * grid[0]
-    active, radius = np.zeros(m, np.int32), np.zeros(len(x), np.int32)
+    masks, radius = np.zeros((m, SIDE), np.uint8), np.zeros(len(x), np.int32)
+    window = np.zeros(3 * SIDE, np.int64)
     stamps, block_stamps = np.zeros(SIDE * SIDE * m, np.int16), np.zeros(m, np.int16)
     far, changed = np.zeros(m, np.int32), np.empty(m, np.int32)
     moved, fresh = np.empty(len(x), np.int32), np.empty(len(x), np.uint8)
     best, shade, to = np.zeros((4, 2), np.int64), np.zeros((4, 2), np.int64), np.zeros(4, np.int64)
     for b in range(m):
         for p in range(starts[SIDE * SIDE * b], starts[SIDE * SIDE * (b + 1)]):
-            active[b] += state[p] != 0
+            if state[p]:
+                _use(p, b, x, y, grid, masks)
     n_changed = 0
     for count in range(1, most_passes + 1):
         n_moved = 0
@@ -374,15 +390,36 @@ def grow(x: Any, y: Any, z: Any, state: Any, grid: Any, starts: Any, keys: Any, 
                     b, far[b], wide, count - 1, keys, table, near, block_stamps, changed, n_changed)):  # fmt: skip
                 continue
             widest = np.int32(0)
+            _window(b, near, masks, window)
             for o in range(starts[SIDE * SIDE * b], starts[SIDE * SIDE * (b + 1)]):
                 if state[o] == GROUND:
                     continue
                 if count == 1 or _point_touched(o, b, radius[o], x, y, grid, near, count - 1, stamps, block_stamps):
                     _search(
-                        o, b, x, y, z, state, grid, starts, keys, table, near, active, reach, nearest, best, shade, to
+                        o,
+                        b,
+                        x,
+                        y,
+                        z,
+                        state,
+                        grid,
+                        starts,
+                        keys,
+                        table,
+                        near,
+                        masks,
+                        window,
+                        reach,
+                        nearest,
+                        best,
+                        shade,
+                        to,
                     )
-                    radius[o] = _radius(best, reach, nearest)
-                    accepted = _accepts(o, x, y, z, best, tolerance, fewest)
+                    radius[o] = _radius(best, reach)
+                    found = 0
+                    for k in range(4):
+                        found += best[k, 0] >= 0
+                    accepted = found >= fewest and _misfit(o, x, y, z, best) < tolerance
                     after = _next(state[o], accepted, _doubt(o, x, y, z, best, shade, reach, nearest, known))
                     if after != state[o]:
                         moved[n_moved], fresh[n_moved] = o, after
@@ -399,7 +436,7 @@ def grow(x: Any, y: Any, z: Any, state: Any, grid: Any, starts: Any, keys: Any, 
             while starts[SIDE * SIDE * (block + 1)] <= p:
                 block += 1
             i, j = (x[p] - grid[1]) // grid[0], (y[p] - grid[2]) // grid[0]
-            active[block] += state[p] == 0
+            _use(p, block, x, y, grid, masks)
             state[p] = fresh[k]
             stamps[block * SIDE * SIDE + (i & 7) * SIDE + (j & 7)] = count
             if block_stamps[block] != count:

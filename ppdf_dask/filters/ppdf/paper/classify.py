@@ -6,14 +6,17 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from ppdf_dask.filters.cloud import Bools, Cloud, Verdict
 from ppdf_dask.filters.ppdf.paper.canopy import under_canopy
 from ppdf_dask.filters.ppdf.paper.growth import GROUND, MOST_PASSES, UNPROVEN, grow
 from ppdf_dask.filters.ppdf.paper.params import PaperParams
 from ppdf_dask.filters.ppdf.paper.planes import Planes, lowest_seeds, plane_seeds
-from ppdf_dask.filters.ppdf.paper.squares import Squares, cut_by_edge, sort_by_square
+from ppdf_dask.filters.ppdf.paper.squares import Longs, Squares, cut_by_edge, sort_by_square
 from ppdf_dask.grid import MM, Rect
+
+States = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -117,31 +120,37 @@ def stages(cloud: Cloud, params: PaperParams) -> Stages:
     else:
         under, planes = np.ones(cloud.n, bool), Planes.none()
         seeds = lowest_seeds(squares)
-    ground, unproven, passes = _grown(cloud, squares, seeds, uncertain, params)
-    start = np.zeros(cloud.n, bool) if cloud.fixed is None else cloud.fixed.copy()
-    start[squares.order] |= seeds
-    return Stages(_back(under, squares), planes, start, _back(ground, squares), _back(unproven, squares), passes)
-
-
-def _grown(
-    cloud: Cloud, squares: Squares, seeds: Bools, uncertain: Bools, params: PaperParams
-) -> tuple[Bools, Bools, int]:
-    """Grow over the distinct places, so that exact duplicates get one label: ground, unproven (sorted), passes."""
     place = squares.places()
-    n = int(place[-1]) + 1 if len(place) else 0
-    state = np.zeros(n, np.uint8)
-    counts = np.diff(squares.starts)
-    state[place[np.repeat(uncertain, counts)]] = UNPROVEN
+    start = _start(cloud, squares, place, seeds, uncertain)
+    end, passes = _grown(cloud, squares, place, start, params)
+    return Stages(
+        under_canopy=_back(under, squares),
+        planes=planes,
+        seeds=_back(start[place] & GROUND != 0, squares),
+        ground=_back(end[place] & GROUND != 0, squares),
+        unproven=_back(end[place] & UNPROVEN != 0, squares),
+        passes=passes,
+    )
+
+
+def _start(cloud: Cloud, squares: Squares, place: Longs, seeds: Bools, uncertain: Bools) -> States:
+    """Return the state of each distinct place before growth, so that exact duplicates get one label."""
+    state = np.zeros(int(place[-1]) + 1 if len(place) else 0, np.uint8)
+    state[place[np.repeat(uncertain, np.diff(squares.starts))]] = UNPROVEN
     state[place[seeds]] |= GROUND
     if cloud.fixed is not None:
         state[place[cloud.fixed[squares.order]]] = GROUND
-    first = np.searchsorted(place, np.arange(n))
+    return state
+
+
+def _grown(cloud: Cloud, squares: Squares, place: Longs, state: States, params: PaperParams) -> tuple[States, int]:
+    """Grow over the distinct places."""
+    first = np.searchsorted(place, np.arange(len(state)))
     # Squares weighted by their points: the density that most points see.
-    density = float((counts.astype(float) ** 2).sum()) / max(1, cloud.n) / (squares.edge / MM) ** 2
+    counts = np.diff(squares.starts).astype(float)
+    density = float((counts**2).sum()) / max(1, cloud.n) / (squares.edge / MM) ** 2
     points = squares.x[first], squares.y[first], squares.z[first]
-    state, passes = grow(points, state, density, _relative(cloud), params)
-    grown = state[place]
-    return grown & GROUND != 0, grown & UNPROVEN != 0, passes
+    return grow(points, state, density, _relative(cloud), params)
 
 
 def _relative(cloud: Cloud) -> Rect | None:
