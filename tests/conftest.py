@@ -1,0 +1,39 @@
+"""Shared fixtures: labelled clouds where the machine has them, a small survey, a cluster in threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import Client, LocalCluster
+
+from ppdf_dask.synthetic import SyntheticParams, write_survey
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Folder of the labelled clouds; tests that want it are skipped, visibly, where it is not set."""
+    folder = os.environ.get("PPDF_DASK_DATA")
+    if not folder:
+        pytest.skip("PPDF_DASK_DATA is not set: no labelled clouds here")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def small_survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write nine 40 m tiles of forest on a hillside, about 35 000 points, with truth/ beside tiles/."""
+    folder = tmp_path_factory.mktemp("survey")
+    write_survey(folder, SyntheticParams(density=1.5), extent=(600, 600, 720, 720), tile_size=40)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def client() -> Iterator[Client]:
+    """Give a real scheduler and two worker threads inside this process: quick, and debuggable."""
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
+        Client(cluster) as made,
+    ):
+        yield made
