@@ -39,6 +39,10 @@ _COG_OPTIONS = {
 }
 
 
+_GDAL_CACHE_MB = 128
+"""GDAL would take 5 % of the machine's memory in each worker."""
+
+
 def raster_attributes(params: DtmParams, unit_z: float = 1.0) -> dict[str, dict[str, Any]]:
     """Return the variables of the stored terrain model with their attributes.
 
@@ -140,7 +144,7 @@ def open_dtm(store: str | os.PathLike[str], variable: str = "height", *, dask: b
     """
     import xarray as xr
 
-    import_rio()
+    _import_rio()
     group = Path(store) / "dtm"
     if not (group / "zarr.json").is_file():
         raise StoreError(f"{group} does not exist; the run has no terrain model yet: give the same `run` command again")
@@ -152,7 +156,7 @@ def open_dtm(store: str | os.PathLike[str], variable: str = "height", *, dask: b
     return array
 
 
-def import_rio() -> None:
+def _import_rio() -> None:
     """Register the ``.rio`` accessor."""
     import rioxarray  # noqa: F401
 
@@ -181,7 +185,7 @@ def write_cog(dtm: xr.DataArray, path: str | os.PathLike[str]) -> Path:
     import rasterio.shutil
     from rasterio.windows import Window
 
-    import_rio()
+    _import_rio()
     path = Path(path)
     plain, whole = (path.with_name(f".{path.stem}.{os.getpid()}.{part}.tif") for part in ("plain", "cog"))
     rows, columns = dtm.shape
@@ -203,16 +207,17 @@ def write_cog(dtm: xr.DataArray, path: str | os.PathLike[str]) -> Path:
         "sparse_ok": True,
     }
     try:
-        with rasterio.open(plain, "w", **profile) as target:
-            target.units = (str(dtm.attrs.get("units", "")),)
-            target.set_band_description(1, "height" if dtm.name is None else str(dtm.name))
-            for r, c in _windows(rows, columns):
-                # Not on the cluster: this runs inside one of its tasks.
-                part = dtm[r : r + BLOCK, c : c + BLOCK].compute(scheduler="synchronous")
-                values = np.asarray(part.values, dtype=np.float32)
-                if not np.isnan(values).all():
-                    target.write(values, 1, window=Window(c, r, values.shape[1], values.shape[0]))
-        rasterio.shutil.copy(plain, whole, driver="COG", **_COG_OPTIONS)
+        with rasterio.Env(GDAL_CACHEMAX=_GDAL_CACHE_MB):
+            with rasterio.open(plain, "w", **profile) as target:
+                target.units = (str(dtm.attrs.get("units", "")),)
+                target.set_band_description(1, "height" if dtm.name is None else str(dtm.name))
+                for r, c in _windows(rows, columns):
+                    # Not on the cluster: this runs inside one of its tasks.
+                    part = dtm[r : r + BLOCK, c : c + BLOCK].compute(scheduler="synchronous")
+                    values = np.asarray(part.values, dtype=np.float32)
+                    if not np.isnan(values).all():
+                        target.write(values, 1, window=Window(c, r, values.shape[1], values.shape[0]))
+            rasterio.shutil.copy(plain, whole, driver="COG", **_COG_OPTIONS)
         os.replace(whole, path)
     finally:
         for leftover in (plain, whole):
