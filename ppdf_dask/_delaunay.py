@@ -1,8 +1,9 @@
 """Delaunay triangulation of integer points: incremental, exact, and unique.
 
-Own code because no library at hand does all three: startinpy inserts 0.3 to 0.4 million points per second and takes
-600 bytes for each (this module: see the benchmark in the README), SciPy's Qhull drops points at map coordinates, and
-with four points on one circle, the rule for gridded data, every library's result depends on the order of the points.
+Own code because no library at hand does all three: on one core here startinpy 0.12.3 inserts 0.31 million
+points per second in Morton order, 0.43 in Hilbert order, and takes 600 bytes for each (this module: 1.2 to 2.0 million,
+100 bytes with everything around it), SciPy's Qhull drops points at map coordinates, and with four points on one circle,
+the rule for gridded data, every library's result depends on the order of the points.
 
 Here all predicates are exact in 64-bit integers, and a tie is broken by symbolic perturbation of the lifted points: of
 four points on one circle the one with the largest (x, y) counts as raised infinitesimally (Devillers and Teillaud,
