@@ -260,12 +260,12 @@ def plan(
 
 def _eligible(tile: Tile, last: bool) -> float:
     """Points a tile offers: last and only returns are as many as the pulses, which the header counts."""
-    pulses = getattr(tile, "first_returns", 0)
+    pulses = tile.first_returns
     return float(pulses if last and 0 < pulses < tile.point_count else tile.point_count)
 
 
 def _extent(tile: Tile) -> int:
-    return 0 if tile.bounds is None else tile.bounds.width * tile.bounds.height
+    return tile.bounds.width * tile.bounds.height
 
 
 def _area_mm2(survey: Survey) -> int:
@@ -282,8 +282,6 @@ def _estimate(survey: Survey, grid: ChunkGrid, buffer: int, last: bool) -> list[
     loaded: dict[tuple[int, int], float] = {}
     for tile in survey.tiles:
         b = tile.bounds
-        if b is None:
-            continue
         per_area = _eligible(tile, last) / max(b.width * b.height, 1)
         for chunk in grid.over(b.grow(buffer)):
             key = (chunk.ix, chunk.iy)
