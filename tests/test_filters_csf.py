@@ -44,6 +44,18 @@ def test_the_order_of_the_points_does_not_matter_nor_does_a_second_run():
     assert (classify(cloud_of(moved), CsfParams()).ground == ground).all()
 
 
+def test_equally_near_points_do_not_depend_on_their_order():
+    # Each particle of the cloth has four points at the same distance, of different heights.
+    rng = np.random.default_rng(4)
+    xy = 500 * np.stack(np.meshgrid(np.arange(40), np.arange(40)), axis=-1).reshape(-1, 2)
+    pts = np.column_stack([xy + 250, rng.integers(0, 3000, len(xy))])
+    # The cloth's first particle hangs over the lowest x and y.
+    pts = np.vstack([pts, [[0, 0, 0]]])
+    ground = classify(cloud_of(pts), CsfParams()).ground
+    order = rng.permutation(len(pts))
+    assert (classify(cloud_of(pts[order]), CsfParams()).ground == ground[order]).all()
+
+
 def test_parameters_reach_the_library():
     pts, _ = scene()
     counts = {

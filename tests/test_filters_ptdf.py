@@ -200,3 +200,16 @@ def test_too_wide_for_the_exact_predicates():
     pts = [(200_000 * k, 0, 0) for k in range(700)]
     with pytest.raises(ParameterError, match=r"134218 m .*--chunk-size"):
         classify(cloud_of(pts), PtdfParams())
+
+
+def test_points_on_edges_belong_to_one_facet_whatever_the_order():
+    # On a grid of 250 mm most points lie on an edge of the TIN of every fourth one.
+    rng = np.random.default_rng(5)
+    xy = 250 * np.stack(np.meshgrid(np.arange(48), np.arange(48)), axis=-1).reshape(-1, 2)
+    pts = np.column_stack([xy, rng.integers(0, 400, len(xy))])
+    params = PtdfParams(window=3.0, spacing=1.0, tolerance=0.1)
+    ground = classify(cloud_of(pts), params).ground
+    assert 0.2 < ground.mean() < 0.9
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(len(pts))
+        assert (classify(cloud_of(pts[order]), params).ground == ground[order]).all()

@@ -151,5 +151,5 @@ FILTER = Filter(
     required_buffer=required_buffer,
     exact=False,
     resolve=_keep,
-    bytes_per_point=60.0,
+    bytes_per_point=260.0,
 )
