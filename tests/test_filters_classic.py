@@ -95,19 +95,26 @@ def load(name):
 
 
 # Total error in % of PDAL 2.10 (SMRF, PMF, CSF) and lasR 0.21 (PTD) at their defaults, and how far ours may be from it.
-# Their rasters hang at the cloud's corner, ours at absolute cells, and of equally near cells they fill a gap with any,
-# we with the mean of all. lasR adds points in the order of their height, not facet by facet.
+# Their rasters hang at the cloud's corner, ours at absolute cells: the clouds are moved so that both are the same. What
+# remains: of equally near cells they fill a gap with any, we with the mean of all; heights on a tolerance to the
+# centimetre (0.15 m in PMF) fall either way in floating point, and always out in integers; lasR adds points in the
+# order of their height, not facet by facet.
 PEERS = [
-    ("smrf", "default", "isprs_samp51", 5.60, 0.5),
-    ("smrf", "default", "isprs_samp12", 3.15, 0.5),
-    ("smrf", "default", "pyfor_test", 6.73, 0.1),
-    ("smrf", "default", "fontblanche_m30", 1.02, 0.1),
-    ("pmf", "pdal", "isprs_samp31", 4.05, 0.1),
-    ("pmf", "pdal", "isprs_samp12", 5.91, 0.2),
-    ("pmf", "pdal", "fontblanche_m30", 3.32, 0.3),
-    ("ptdf", "lasr", "isprs_samp12", 10.25, 0.5),
+    ("smrf", "default", "isprs_samp11", 9.92, 0.2),
+    ("smrf", "default", "isprs_samp12", 3.15, 0.2),
+    ("smrf", "default", "isprs_samp31", 3.39, 0.2),
+    ("smrf", "default", "isprs_samp51", 5.60, 0.2),
+    ("smrf", "default", "pdal_utm42_mountain", 4.43, 0.2),
+    ("smrf", "default", "pyfor_test", 6.73, 0.2),
+    ("smrf", "default", "fontblanche_m30", 1.02, 0.2),
+    ("pmf", "pdal", "isprs_samp12", 5.91, 1.3),
+    ("pmf", "pdal", "isprs_samp31", 4.05, 1.3),
+    ("pmf", "pdal", "pdal_utm42_mountain", 21.45, 1.3),
+    ("pmf", "pdal", "lidR_topography", 9.58, 1.3),
+    ("pmf", "pdal", "fontblanche_m30", 3.32, 1.3),
+    ("ptdf", "lasr", "isprs_samp12", 10.25, 1.0),
     ("ptdf", "lasr", "isprs_samp31", 10.72, 1.0),
-    ("ptdf", "lasr", "fontblanche_m30", 2.54, 0.2),
+    ("ptdf", "lasr", "fontblanche_m30", 2.54, 1.0),
     ("csf", "default", "fontblanche_m30", 1.09, 0.05),
 ]
 
@@ -119,6 +126,7 @@ def test_agreement_with_the_peers(name, profile, cloud, peer, distance):
     xyz, seen, scored, reference = load(cloud)
     ground = np.zeros(len(xyz), bool)
     found = filters.get(name)
-    ground[seen] = found.classify(cloud_from_xyz(xyz[seen]), found.profiles[profile]).ground
+    at_corner = xyz[seen] - xyz[seen].min(axis=0)
+    ground[seen] = found.classify(cloud_from_xyz(at_corner), found.profiles[profile]).ground
     total = 100 * np.mean(ground[scored] != reference[scored])
     assert total == pytest.approx(peer, abs=distance)

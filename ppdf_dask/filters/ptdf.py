@@ -118,7 +118,7 @@ def classify(cloud: Cloud, params: Parameters) -> Verdict:
 
 
 def required_buffer(params: Parameters) -> float:
-    """Return five windows, metres: in chunks of 250 m of a sparse tile 3 of 221 131 points then changed at the seams."""
+    """Return five windows, metres: so cut into 250 m chunks, 3 of the 221 131 points of a sparse tile changed."""
     assert isinstance(params, PtdfParams)
     return 5.0 * params.window
 
