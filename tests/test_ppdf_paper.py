@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ppdf_dask.filters import classify_ground, of, parameters
 from ppdf_dask.filters.cloud import Cloud, cloud_from_grid, cloud_from_xyz
 from ppdf_dask.filters.ppdf.paper import _plane_kernels
 from ppdf_dask.filters.ppdf.paper.classify import classify, stages
@@ -287,3 +288,64 @@ def test_identical_and_far_points_are_harmless():
     ground = classify(cloud_from_xyz(far), PaperParams()).ground
     assert not ground[-3:].any()
     assert ground[:-3].mean() > 0.9
+
+
+def test_a_tie_just_beyond_the_searched_buckets_is_seen():
+    # Four points per m2 make buckets of 1 m. In the first quadrant of (600, 600) a ground point lies 400 mm away, as
+    # far as the bucket's edge, where a lower one waits at the same distance; the other quadrants are settled at once.
+    others = [[320, 880, 0], [320, 320, 0], [880, 320, 0]]
+    points = np.array([[0, 0, 90_000], [600, 600, 1000], [840, 920, 0], [1000, 600, -20_000], *others], np.int32)
+    start = np.array([0, 0, 1, 1, 1, 1, 1], np.uint8)
+    for last, accepted in ((-20_000, 0), (20_000, 1)):
+        points[3, 2] = last
+        assert grow(tuple(points.T.copy()), start, 4.0, None, PaperParams())[0][1] == accepted
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_a_point_is_proven_only_if_a_nearer_or_equal_neighbour_cannot_hide(turn):
+    # The nearest ground of the first quadrant lies 1 m away; an unknown point straight to the right could tie with it.
+    points = np.array([[0, 0, 0], [800, 600, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    for hidden_from, state in ((1000, 3), (1001, 1)):
+        box = np.array([[-5000, -5000], [hidden_from - 1, 5000]])
+        turned, corners = points.copy(), box.copy()
+        for _ in range(turn):
+            turned[:, :2] = np.column_stack([-turned[:, 1], turned[:, 0]])
+            corners = np.column_stack([-corners[:, 1], corners[:, 0]])
+        (x0, y0), (x1, y1) = corners.min(axis=0).tolist(), (corners.max(axis=0) + 1).tolist()
+        got, _ = grow(
+            tuple(turned.astype(np.int32).T.copy()),
+            np.array([0, 1, 1, 1, 1], np.uint8), 1.0, Rect(x0, y0, x1, y1), PaperParams(),
+        )  # fmt: skip
+        assert got[0] == state
+
+
+def test_an_unproven_neighbour_makes_unproven_unless_it_is_farther():
+    near = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) * 1000
+    for place, state in ((900, 3), (1100, 1)):
+        points = np.vstack([near, [[place, 900, 9000], [0, 0, 0]]]).astype(np.int32)
+        start = np.array([1, 1, 1, 1, 2, 0], np.uint8)
+        got, _ = grow(tuple(points.T.copy()), start, 1.0, Rect(-9000, -9000, 9000, 9000), PaperParams(search_limit=5.0))
+        assert got[5] == state
+
+
+def test_a_canopy_cell_cut_by_the_edge_makes_its_square_unproven():
+    # Squares of 3 m, canopy cells of 2 m: the cell from 2 to 4 m reaches over the square's edge at 3 m.
+    params = PaperParams(plane_size=3.0, canopy_cell=2.0, min_inliers=3, canopy_height=1.0)
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(0.25, 3, 0.5), np.arange(0.25, 3, 0.5)))
+    points = np.rint(np.column_stack([x, y, 0 * x]) * 1000).astype(np.int64)
+    unproven = [crop_verdict(points, Rect(-9000, -9000, edge, 9000), params) for edge in (3000, 4000)]
+    assert unproven[0].all()
+    # The square itself is then settled: its seeds are proven ground whatever lies beyond.
+    assert not unproven[1].any()
+
+
+def crop_verdict(points, rect, params):
+    return classify(crop(points, rect)[1], params).unproven
+
+
+def test_the_published_method_is_a_profile_of_ppdf():
+    paper = parameters("ppdf", "paper")
+    assert paper == PaperParams()
+    points = scene(5, n=3000) / 1000
+    assert (classify_ground(points, paper) == classify(cloud_from_xyz(points), PaperParams()).ground).all()
+    assert of(paper).required_buffer(paper) == 50.0

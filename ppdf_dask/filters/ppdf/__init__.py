@@ -9,6 +9,7 @@ from __future__ import annotations
 from ppdf_dask.errors import ParameterError
 from ppdf_dask.filters import Filter
 from ppdf_dask.filters.cloud import Cloud, Density, Verdict
+from ppdf_dask.filters.ppdf.paper.params import PaperParams
 from ppdf_dask.filters.ppdf.robust.params import RobustParams
 from ppdf_dask.params import Parameters
 
@@ -18,11 +19,15 @@ def _classify(cloud: Cloud, params: Parameters) -> Verdict:
         from ppdf_dask.filters.ppdf.robust.classify import classify
 
         return classify(cloud, params)
+    if isinstance(params, PaperParams):
+        from ppdf_dask.filters.ppdf.paper.classify import classify as classify_as_published
+
+        return classify_as_published(cloud, params)
     raise ParameterError(f"PPDF has no profile of type {type(params).__name__}")
 
 
 def _required_buffer(params: Parameters) -> float:
-    if isinstance(params, RobustParams):
+    if isinstance(params, RobustParams | PaperParams):
         return params.required_buffer()
     raise ParameterError(f"PPDF has no profile of type {type(params).__name__}")
 
@@ -33,7 +38,7 @@ def _resolve(params: Parameters, density: Density) -> Parameters:
 
 FILTER = Filter(
     name="ppdf",
-    profiles={"robust": RobustParams()},
+    profiles={"robust": RobustParams(), "paper": PaperParams()},
     classify=_classify,
     required_buffer=_required_buffer,
     exact=True,

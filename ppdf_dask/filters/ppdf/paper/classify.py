@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ppdf_dask.filters.cloud import Bools, Cloud, Verdict
+from ppdf_dask.filters.cloud import Bools, Cloud, Ints, Verdict
 from ppdf_dask.filters.ppdf.paper.canopy import under_canopy
 from ppdf_dask.filters.ppdf.paper.growth import GROUND, MOST_PASSES, UNPROVEN, grow
 from ppdf_dask.filters.ppdf.paper.params import PaperParams
 from ppdf_dask.filters.ppdf.paper.planes import Planes, lowest_seeds, plane_seeds
-from ppdf_dask.filters.ppdf.paper.squares import Longs, Squares, cut_by_edge, sort_by_square
+from ppdf_dask.filters.ppdf.paper.squares import Squares, cut_by_edge, sort_by_square
 from ppdf_dask.grid import MM, Rect
 
 States = npt.NDArray[np.uint8]
@@ -133,7 +133,7 @@ def stages(cloud: Cloud, params: PaperParams) -> Stages:
     )
 
 
-def _start(cloud: Cloud, squares: Squares, place: Longs, seeds: Bools, uncertain: Bools) -> States:
+def _start(cloud: Cloud, squares: Squares, place: Ints, seeds: Bools, uncertain: Bools) -> States:
     """Return the state of each distinct place before growth, so that exact duplicates get one label."""
     state = np.zeros(int(place[-1]) + 1 if len(place) else 0, np.uint8)
     state[place[np.repeat(uncertain, np.diff(squares.starts))]] = UNPROVEN
@@ -143,9 +143,9 @@ def _start(cloud: Cloud, squares: Squares, place: Longs, seeds: Bools, uncertain
     return state
 
 
-def _grown(cloud: Cloud, squares: Squares, place: Longs, state: States, params: PaperParams) -> tuple[States, int]:
+def _grown(cloud: Cloud, squares: Squares, place: Ints, state: States, params: PaperParams) -> tuple[States, int]:
     """Grow over the distinct places."""
-    first = np.searchsorted(place, np.arange(len(state)))
+    first = np.diff(place, prepend=np.int32(-1)) != 0
     # Squares weighted by their points: the density that most points see.
     counts = np.diff(squares.starts).astype(float)
     density = float((counts**2).sum()) / max(1, cloud.n) / (squares.edge / MM) ** 2

@@ -97,19 +97,26 @@ def _buckets(
     """Sort points by block and bucket: their order, the occupied blocks' keys, the bounds of the buckets."""
     side = kernels.SIDE
     i, j = (x.astype(np.int64) - left) // edge, (y.astype(np.int64) - bottom) // edge
-    bucket = i % side * side + j % side
-    i //= side
-    j //= side
-    rows = int(j.max()) + 1
-    block = i * rows + j
-    order = np.argsort(block * side * side + bucket)
-    block, bucket = block[order], bucket[order]
+    rows = int(j.max()) // side + 1
+    key = i // side * rows
+    key += j // side
+    key *= side * side
+    i %= side
+    i *= side
+    key += i
+    j %= side
+    key += j
+    del i, j
+    order = np.argsort(key)
+    key = key[order]
+    block = key // (side * side)
     fresh = np.ones(len(block), bool)
     fresh[1:] = np.diff(block) != 0
     unique = block[fresh]
     keys = (unique // rows << 32) + unique % rows
-    place = (np.cumsum(fresh) - 1) * side * side + bucket
-    counts = np.bincount(place, minlength=side * side * len(keys))
-    starts = np.zeros(len(counts) + 1, np.int32)
-    np.cumsum(counts, out=starts[1:])
+    # Renumber the blocks: only the occupied ones have buckets.
+    key -= block * side * side
+    key += (np.cumsum(fresh) - 1) * (side * side)
+    starts = np.zeros(side * side * len(keys) + 1, np.int32)
+    np.cumsum(np.bincount(key, minlength=side * side * len(keys)), out=starts[1:])
     return order, keys, starts

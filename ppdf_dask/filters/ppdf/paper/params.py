@@ -76,3 +76,10 @@ class PaperParams(Parameters):
     min_neighbours: int = quantity(1, "points", low=1, high=4, doc="fewest neighbouring ground points")
     seeds: Literal["planes", "local_minimum"] = "planes"
     neighbours: Literal["quadrants", "nearest"] = "quadrants"
+
+    def required_buffer(self) -> float:
+        """Return the first guess of the buffer in metres: a plane square and 40 m of growth.
+
+        At 15 points/m2 and more it proves nearly every point; where it does not, the task widens it.
+        """
+        return self.plane_size + min(40.0, self.search_limit)

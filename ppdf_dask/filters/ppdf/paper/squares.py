@@ -39,13 +39,13 @@ class Squares:
     iy: Longs
     starts: Longs
 
-    def places(self) -> Longs:
-        """Return a number from 0 for each distinct (x, y, z): int64 (n,), ascending, equal for exact duplicates."""
+    def places(self) -> Ints:
+        """Return a number from 0 for each distinct (x, y, z): int32 (n,), ascending, equal for exact duplicates."""
         fresh = np.ones(len(self.x), bool)
         fresh[1:] = np.diff(self.x) != 0
         fresh[1:] |= np.diff(self.y) != 0
         fresh[1:] |= np.diff(self.z) != 0
-        return np.cumsum(fresh) - 1
+        return np.cumsum(fresh, dtype=np.int32) - np.int32(1)
 
 
 def sort_by_square(cloud: Cloud, edge: int) -> Squares:
@@ -73,6 +73,7 @@ def sort_by_square(cloud: Cloud, edge: int) -> Squares:
     ix, dx = np.divmod(cloud.x.astype(np.int64) + cloud.origin[0], edge)
     iy, dy = np.divmod(cloud.y.astype(np.int64) + cloud.origin[1], edge)
     order = _order(ix, iy, dx, dy, cloud.z, edge)
+    del dx, dy
     ix, iy = ix[order], iy[order]
     fresh = np.flatnonzero((np.diff(ix) != 0) | (np.diff(iy) != 0)) + 1
     first = np.concatenate([np.zeros(min(1, cloud.n), np.int64), fresh])
