@@ -118,18 +118,23 @@ def demo(out: Path, **cluster: Any) -> None:
     \b
     ppdf-dask demo
     """
-    from ppdf_dask.demo import evaluate_demo, make_demo
+    from rich.console import Console
 
-    tiles = make_demo(out)
+    from ppdf_dask.demo import evaluate_demo, make_demo
     from ppdf_dask.plan import plan as make_plan
     from ppdf_dask.survey import scan as scan_tiles
 
+    console = Console(stderr=True, quiet=cluster["quiet"])
+    with console.status("making the synthetic survey"):
+        tiles = make_demo(out)
     survey = scan_tiles([tiles])
     if not cluster["quiet"]:
         click.echo(repr(survey), err=True)
     result = _run(make_plan(survey, out=out / "run"), cluster, overwrite=False, accept_changes=True)
+    with console.status("comparing with the known ground"):
+        errors = evaluate_demo(out, result)
     click.echo(repr(result))
-    click.echo(evaluate_demo(out, result))
+    click.echo(errors)
 
 
 @click.command()
