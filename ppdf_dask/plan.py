@@ -19,6 +19,7 @@ from ppdf_dask.survey import Survey, Tile
 
 if TYPE_CHECKING:
     from distributed import Client
+    from matplotlib.axes import Axes
 
     from ppdf_dask.events import Event
     from ppdf_dask.result import Result
@@ -187,6 +188,12 @@ class Plan:
             "disk_mb": self.disk_mb,
             "params": self.params.as_dict(),
         }
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the chunks over the tiles, see `plot.plan_map`; returns the axes."""
+        from ppdf_dask.plot import plan_map
+
+        return plan_map(self, ax)
 
     def __repr__(self) -> str:
         f = self.facts()

@@ -16,6 +16,8 @@ from ppdf_dask.store import RunStore
 if TYPE_CHECKING:
     import xarray as xr
 
+    from ppdf_dask.plot import ResultPlots
+
 
 class Result:
     """A run's folder, read back.
@@ -61,6 +63,13 @@ class Result:
         from ppdf_dask.mosaic import open_dtm
 
         return open_dtm(self.out / "run.zarr")
+
+    @property
+    def plot(self) -> ResultPlots:
+        """Pictures: ``plot.hillshade()``, ``plot.section(line, width)``, ``plot.planes()``, ``plot.map()``."""
+        from ppdf_dask.plot import ResultPlots
+
+        return ResultPlots(self)
 
     @property
     def chunks(self) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ppdf_dask import crs as crs_module
 from ppdf_dask.crs import Frame
@@ -19,6 +19,9 @@ from ppdf_dask.pairs import Duplicates, Overlap, duplicate_problems, find_duplic
 from ppdf_dask.params import ClassRules
 from ppdf_dask.reader import batches
 from ppdf_dask.tiles import Problem, Tile, bounds_in_mm, find_files, named, output_names, problem_dict, shown
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Duplicates", "Overlap", "Problem", "Survey", "Tile", "find_overlaps", "measure", "scan"]
 
@@ -98,6 +101,12 @@ class Survey:
             unit_z=values["unit_z"],
             problems=tuple(Problem(**p) for p in values["problems"]),
         )
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the tiles as a map, see `plot.survey_map`; returns the axes."""
+        from ppdf_dask.plot import survey_map
+
+        return survey_map(self, ax)
 
     def __repr__(self) -> str:
         from ppdf_dask.surveyview import as_text
