@@ -16,6 +16,7 @@ from ppdf_dask import tasks
 from ppdf_dask.errors import ParameterError, PlanError, ResumeError, SurveyError
 from ppdf_dask.filters import classify_ground
 from ppdf_dask.grid import ChunkGrid, Rect
+from ppdf_dask.index import Index
 from ppdf_dask.neighbourhood import Cut
 from ppdf_dask.params import ChunkParams, ClassRules, DtmParams, RunParams
 from ppdf_dask.plan import plan
@@ -106,7 +107,9 @@ def test_terrain_model_is_the_tin_of_the_written_ground(finished):
     _, first = np.unique(ground[:, :2], axis=0, return_index=True)
     x, y = np.meshgrid(dtm.x.values - 600.0, dtm.y.values - 600.0)
     expected = LinearNDInterpolator(ground[first, :2], ground[first, 2])(x, y)
-    inside = (x > 5) & (x < 115) & (y > 5) & (y < 115)
+    # Flat triangles at the hull have circles beyond max_edge and give no height: tests/test_dtm.py looks at that rule.
+    inside = np.isfinite(dtm.values)
+    assert inside[(x > 5) & (x < 115) & (y > 5) & (y < 115)].mean() > 0.99
     # Heights come back as float32: half a unit in the last place of 1024 m, and SciPy's own rounding.
     np.testing.assert_allclose(dtm.values[inside], expected[inside], rtol=0, atol=2**-14 + 1e-6)
 
@@ -200,6 +203,7 @@ def _masks(url: Path, folder: Path, size: float, buffer: float, order: int) -> d
     store = RunStore(str(url))
     store.create({})
     records = [tasks.tile(str(url), job, "f") for job in jobs]
+    Index.of({job.source: record for job, record in zip(jobs, records, strict=True)}).publish(store)
     bounds = [Rect(*r["bounds"]) for r in records if r["eligible"]]
     extent = bounds[0]
     for b in bounds[1:]:
