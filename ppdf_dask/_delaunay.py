@@ -240,6 +240,13 @@ def _curve_order(points, level):  # type: ignore[no-untyped-def]
     return order
 
 
+def curve_order(points: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return the order of `points`, (n, 2 or more), along a Hilbert curve: neighbours in it are near in the plane."""
+    level = max(1, int(np.ceil(np.log2(max(len(points) / _POINTS_PER_CELL, 1)) / 2)))
+    order: NDArray[np.int64] = _curve_order(points, min(level, 14))
+    return order
+
+
 class Triangulation:
     """A growing Delaunay triangulation of integer points inside a square.
 
@@ -288,6 +295,5 @@ class Triangulation:
         vertices[: self._count] = self.vertices
         triangles = np.empty((2 * room - 6, 6), dtype=np.int32)
         triangles[: 2 * self._count - 6] = self.triangles
-        level = max(1, int(np.ceil(np.log2(max(len(points) / _POINTS_PER_CELL, 1)) / 2)))
-        self._count = int(_insert(points, _curve_order(points, min(level, 14)), vertices, triangles, self._count))
+        self._count = int(_insert(points, curve_order(points), vertices, triangles, self._count))
         self._vertices, self._triangles = vertices, triangles

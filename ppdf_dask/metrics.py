@@ -7,7 +7,6 @@ non-ground points taken for ground. (Sithole and Vosselman 2004 use a to d for t
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
@@ -271,25 +270,24 @@ def tin_rmse(ground: ArrayLike, reference: ArrayLike) -> float:
 
 
 def tin_heights(ground: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Interpolate the TIN of `ground` (N, 3) at `xy` (M, 2), metres; the nearest point's height outside its hull."""
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import KDTree, QhullError
+    """Interpolate the TIN of `ground` (N, 3) at `xy` (M, 2), metres; the nearest point's height outside its hull.
 
-    # Qhull drops points at map coordinates, so the triangulation sees differences to a nearby origin.
-    origin = np.floor(ground[:, :2].min(axis=0))
-    order = np.lexsort((ground[:, 2], ground[:, 1], ground[:, 0]))
-    points = ground[order]
-    first = np.ones(len(points), bool)
-    first[1:] = np.any(points[1:, :2] != points[:-1, :2], axis=1)
-    points = points[first]
-    nodes, at = points[:, :2] - origin, xy - origin
-    heights = np.full(len(at), np.nan)
-    if len(nodes) > 2:
-        with contextlib.suppress(QhullError):  # points on one line span no triangle
-            heights = np.asarray(LinearNDInterpolator(nodes, points[:, 2])(at), dtype=np.float64)
+    Of points with the same x and y the lowest counts. See `ppdf_dask._tin.interpolate` for the exact edge of the hull.
+    """
+    from scipy.spatial import KDTree
+
+    from ppdf_dask._tin import interpolate
+
+    heights = interpolate(ground, xy)
     outside = np.isnan(heights)
     if outside.any():
-        heights[outside] = points[KDTree(nodes).query(at[outside])[1], 2]
+        order = np.lexsort((ground[:, 2], ground[:, 1], ground[:, 0]))
+        points = ground[order]
+        first = np.ones(len(points), bool)
+        first[1:] = np.any(points[1:, :2] != points[:-1, :2], axis=1)
+        points = points[first]
+        origin = np.floor(points[:, :2].min(axis=0))
+        heights[outside] = points[KDTree(points[:, :2] - origin).query(xy[outside] - origin)[1], 2]
     return heights
 
 

@@ -16,6 +16,7 @@ COMMANDS = {
     "run": ("jobs", "classify a survey; on an existing run it resumes"),
     "classify": ("jobs", "one tile in memory, no cluster"),
     "evaluate": ("studies", "compare a classified tile with its reference"),
+    "benchmark": ("benchmark", "accuracy on labelled clouds; speed"),
 }
 """Command name to the module of this package that holds it, loaded when it is called, and what it does."""
 
