@@ -13,7 +13,8 @@ from ppdf_dask.filters.ppdf.robust.classify import classify
 from ppdf_dask.filters.ppdf.robust.params import RobustParams
 from ppdf_dask.grid import Rect
 
-SMALL = RobustParams(cell_size=1.0, search_radius=6.0, largest_building=24.0)
+SMALL = RobustParams(cell_size=1.0, refinement=1, search_radius=6.0, largest_building=24.0, passes=3)
+FINE = SMALL.replace(refinement=2)
 
 
 def scene(seed, n=2500, side=110.0, snap=1):
@@ -48,17 +49,22 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=seeds, fraction=st.tuples(*[st.floats(0, 0.45)] * 4), snap=st.sampled_from([1, 500]))
-def test_what_is_proven_in_a_crop_is_true_of_the_whole(seed, fraction, snap):
+@given(
+    seed=seeds,
+    fraction=st.tuples(*[st.floats(0, 0.45)] * 4),
+    snap=st.sampled_from([1, 500]),
+    params=st.sampled_from([SMALL, FINE]),
+)
+def test_what_is_proven_in_a_crop_is_true_of_the_whole(seed, fraction, snap, params):
     points = scene(seed, snap=snap)
-    whole = classify(cloud_from_grid(*points.T), SMALL)
+    whole = classify(cloud_from_grid(*points.T), params)
     assert not whole.unproven.any()
     (x0, y0, _), (x1, y1, _) = points.min(axis=0), points.max(axis=0) + 1
     w, h = x1 - x0, y1 - y0
     a, b, c, d = fraction
     rect = Rect(int(x0 + a * w), int(y0 + b * h), int(x1 - c * w), int(y1 - d * h))
     inside, cloud = crop(points, rect)
-    cut = classify(cloud, SMALL)
+    cut = classify(cloud, params)
     proven = ~cut.unproven
     assert np.array_equal(cut.ground[proven], whole.ground[inside][proven])
 
@@ -75,18 +81,18 @@ def test_a_wide_crop_proves_its_middle():
 
 
 @settings(max_examples=15, deadline=None)
-@given(seed=seeds, snap=st.sampled_from([1, 500]))
-def test_neither_order_nor_duplicates_nor_place_decide(seed, snap):
+@given(seed=seeds, snap=st.sampled_from([1, 500]), params=st.sampled_from([SMALL, FINE]))
+def test_neither_order_nor_duplicates_nor_place_decide(seed, snap, params):
     points = scene(seed, snap=snap)
     rng = np.random.default_rng(seed)
-    plain = classify(cloud_from_grid(*points.T), SMALL).ground
+    plain = classify(cloud_from_grid(*points.T), params).ground
     order = rng.permutation(len(points))
-    assert np.array_equal(classify(cloud_from_grid(*points[order].T), SMALL).ground, plain[order])
+    assert np.array_equal(classify(cloud_from_grid(*points[order].T), params).ground, plain[order])
     twice = np.concatenate([points, points[order[: len(order) // 3]]])
-    doubled = classify(cloud_from_grid(*twice.T), SMALL).ground
+    doubled = classify(cloud_from_grid(*twice.T), params).ground
     assert np.array_equal(doubled, np.concatenate([plain, plain[order[: len(order) // 3]]]))
     moved = points + np.array([-7 * 16_000, 3 * 16_000, 123_457])
-    assert np.array_equal(classify(cloud_from_grid(*moved.T), SMALL).ground, plain)
+    assert np.array_equal(classify(cloud_from_grid(*moved.T), params).ground, plain)
 
 
 @settings(max_examples=15, deadline=None)
@@ -152,11 +158,14 @@ def test_fixed_points_are_ground_and_references():
     assert verdict.ground[high]
 
 
-@pytest.mark.parametrize(("points", "cells", "size"), [(225, 4, 1.0), (224, 4, 1.25), (1, 1, 4.0)])
-def test_the_cell_follows_the_density(points, cells, size):
+@pytest.mark.parametrize(
+    ("points", "cells", "size", "parts"),
+    [(225, 4, 2.0, 1), (224, 4, 2.0, 2), (225, 16, 2.0, 2), (900, 64, 2.0, 2), (899, 64, 2.25, 2), (1, 1, 4.0, 2)],
+)
+def test_the_cells_follow_the_density(points, cells, size, parts):
     resolved = RobustParams().resolve(Density(points, cells))
-    assert resolved.cell_size == size
-    assert resolved.resolve(Density(10**9, 1)) is resolved
+    assert (resolved.cell_size, resolved.refinement) == (size, parts)
+    assert resolved.resolve(Density(10**9, 1)) == resolved
 
 
 def test_an_unresolved_cell_size_is_refused():

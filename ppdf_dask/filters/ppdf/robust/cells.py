@@ -15,11 +15,29 @@ SQUARE = 16
 """Cells along the edge of the largest plane square."""
 
 REF = np.uint8(1)
+"""The cell's low point is a reference."""
+
 UNPROVEN = np.uint8(2)
+"""Whether it is a reference could change with a wider known area; without LOW: the cell itself is not known."""
+
 LOW = np.uint8(4)
+"""The cell has a low point."""
+
 DROPPED = np.uint8(8)
+"""A seed of a patch that was not believed: growth may take it back, but not for being near a reference."""
+
 MAYBE_DROPPED = np.uint8(16)
+"""It is not proven whether the low point is DROPPED or ROOF."""
+
 FIXED = np.uint8(32)
+"""The low point is ground by decree."""
+
+ROOF = np.uint8(64)
+"""The low point belongs to a raised patch: never a reference."""
+
+OUTLIER_ROUNDS = 2
+OUTLIER_DEPTH = 1000
+"""A low point this far (mm) below all but two of its neighbours is an outlier."""
 
 NO_FLOOR = np.int32(-(2**31))
 
@@ -70,7 +88,7 @@ def _lowest(x: Any, y: Any, z: Any, fixed: Any, x0: Any, y0: Any, of_point: Any,
 
 
 @njit(nogil=True, cache=True)
-def _flag_outliers(width: Any, pos: Any, floor: Any, state: Any, limit: Any, peel: Any, need: Any, again: Any) -> Any:
+def _flag_outliers(width: Any, pos: Any, floor: Any, state: Any, limit: Any, again: Any) -> Any:
     """Mark in `again` the cells whose low point goes (1) or cannot be judged (2); return how many go."""
     low3 = np.empty(3, np.int64)
     count = 0
@@ -113,9 +131,9 @@ def _flag_outliers(width: Any, pos: Any, floor: Any, state: Any, limit: Any, pee
             continue
         if unknown:
             again[k] = 2
-        elif n >= need:
+        elif n >= 6:
             again[k] = 1
-            floor[k] = min(low3[2] - limit, z + peel)
+            floor[k] = min(low3[2] - limit, z + limit)
             count += 1
     return count
 
@@ -178,11 +196,11 @@ def build(cloud: Cloud, cell: int, pad: int) -> Cells:
     return Cells(width, height, cell, x0, y0, of_point, pos, floor, state)
 
 
-def drop_low_outliers(cloud: Cloud, cells: Cells, peel: int, rounds: int = 2) -> None:
+def drop_low_outliers(cloud: Cloud, cells: Cells) -> None:
     """Remove low points that lie alone more than 1 m below their surroundings (step 2)."""
     again = np.empty(len(cells.state), np.uint8)
-    for _ in range(rounds):
-        _flag_outliers(cells.width, cells.pos, cells.floor, cells.state, 1000, peel, 6, again)
+    for _ in range(OUTLIER_ROUNDS):
+        _flag_outliers(cells.width, cells.pos, cells.floor, cells.state, OUTLIER_DEPTH, again)
         _next_lowest(
             cloud.x, cloud.y, cloud.z, cells.x0, cells.y0, cells.of_point, cells.pos, cells.floor, cells.state, again
         )

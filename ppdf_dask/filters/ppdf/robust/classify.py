@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
-from ppdf_dask.errors import ParameterError
 from ppdf_dask.filters.cloud import Cloud, Verdict
 from ppdf_dask.filters.ppdf.robust import cells as cells_
+from ppdf_dask.filters.ppdf.robust.cells import Cells
+from ppdf_dask.filters.ppdf.robust.fine import halve
 from ppdf_dask.filters.ppdf.robust.growth import clean, grow
 from ppdf_dask.filters.ppdf.robust.label import label
 from ppdf_dask.filters.ppdf.robust.params import RobustParams
-from ppdf_dask.filters.ppdf.robust.patches import judge_components, link_patches
+from ppdf_dask.filters.ppdf.robust.patches import judge_components, link_patches, spread_roofs
 from ppdf_dask.filters.ppdf.robust.planes import find_planes
+from ppdf_dask.filters.ppdf.robust.roughness import local_roughness
 from ppdf_dask.filters.ppdf.robust.windows import fits_one_grid, in_windows
 from ppdf_dask.grid import MM
 
 LOOK_OUT = 12
+"""Cells: how far a seed looks for its own patch before it counts as border."""
+
+NEAR = 3
+"""Cells: low points of two patches so near vote on whether the patches are one surface."""
+
+AGREE = 1.0
+"""Metres: two low points agree when each lies this near to the other's plane."""
+
+ROUGH_REACH = 5
+"""Cells on each side over which the roughness is taken."""
+
+ROUGH_MOST = 1.0
+"""Metres: a residual counts at most this much."""
+
+NO_ROUGHNESS = np.empty(0, np.int32)
+NO_POINTS = np.empty(0, np.bool_)
 
 
 def classify(cloud: Cloud, params: RobustParams) -> Verdict:
@@ -31,39 +50,50 @@ def classify(cloud: Cloud, params: RobustParams) -> Verdict:
     Returns
     -------
     Verdict
-        Masks of the core points.
+        Masks of the core points. Clouds without a plane (0 to 3 points, points on a line, identical points) have
+        no ground.
 
     Raises
     ------
     ParameterError
         When `cell_size` is None.
     """
-    if params.cell_size is None:
-        raise ParameterError("cell_size is not set; call params.resolve(density) first or give cell_size in metres")
+    cell = params.cell_mm
     if cloud.n == 0:
-        return Verdict(np.zeros(cloud.n_core, np.bool_), np.zeros(cloud.n_core, np.bool_))
-    if fits_one_grid(cloud, params.cell_mm):
+        return Verdict(np.zeros(0, np.bool_), np.zeros(0, np.bool_))
+    if fits_one_grid(cloud, cell):
         return classify_area(cloud, params)
-    return in_windows(cloud, params.cell_mm, round(params.required_buffer() * MM), lambda c: classify_area(c, params))
+    return in_windows(cloud, cell, round(params.required_buffer() * MM), lambda c: classify_area(c, params))
 
 
 def classify_area(cloud: Cloud, params: RobustParams) -> Verdict:
     """Classify on one dense grid over all points of the cloud; `classify` without its guard."""
-    ground = np.zeros(cloud.n_core, np.bool_)
-    unproven = np.zeros(cloud.n_core, np.bool_)
     cell = params.cell_mm
-    limit = round(params.search_radius * MM)
-    rings = -(-limit // cell)
+    rings = -(-round(params.search_radius * MM) // cell)
     cells = cells_.build(cloud, cell, max(rings, LOOK_OUT) + 1)
-    cells_.drop_low_outliers(cloud, cells, round(params.peel * MM))
-    width, pos, state = cells.width, cells.pos, cells.state
+    if "outliers" in params.steps:
+        cells_.drop_low_outliers(cloud, cells)
+    if "planes" in params.steps:
+        _seed(cells, params)
+    state = _grow(cells, params) if "growth" in params.steps else cells.state
+    after, rough = np.empty_like(state), np.empty(len(state), np.int32)
+    residuals = np.empty(len(state), np.int32)
+    limit2 = round(params.search_radius * MM) ** 2
+    drop = "cleaning" in params.steps
+    clean(cells.width, cell, cells.pos, state, rings, limit2, drop, residuals, after)
+    local_roughness(cells.width, cells.height, after, residuals, ROUGH_REACH, round(ROUGH_MOST * MM), rough)
+    return _label(cloud, cells, after, rough, params)
+
+
+def _seed(cells: Cells, params: RobustParams) -> None:
+    """Planes, their seeds, and the test that tells terrain from roofs and crowns (steps 4 to 6)."""
+    width, height, cell, pos, state = cells.width, cells.height, cells.cell, cells.pos, cells.state
     lows = int(np.count_nonzero(state & cells_.LOW))
     patch = np.full(len(state), -1, np.int32)
-    planes = np.empty((lows, 3))
-    squares = np.empty((lows, 4), np.int32)
+    planes, squares = np.empty((lows, 3)), np.empty((lows, 4), np.int32)
     count = find_planes(
         width,
-        cells.height,
+        height,
         cell,
         pos,
         state,
@@ -71,15 +101,14 @@ def classify_area(cloud: Cloud, params: RobustParams) -> Verdict:
         planes,
         squares,
         params.trials,
-        params.refits,
         params.inlier_distance,
         params.inlier_share,
         params.division_distance,
     )
-    parent = np.empty(count, np.int32)
-    open_ = np.empty(count, np.bool_)
-    link_patches(width, cell, pos, state, patch, planes, squares, count, 3, 1.0, parent, open_)
-    large = round(params.largest_building * MM)
+    if "roofs" not in params.steps:
+        return
+    parent, open_ = np.empty(count, np.int32), np.empty(count, np.bool_)
+    link_patches(width, cell, pos, state, patch, planes, squares, count, NEAR, AGREE, parent, open_)
     judge_components(
         width,
         cell,
@@ -92,39 +121,131 @@ def classify_area(cloud: Cloud, params: RobustParams) -> Verdict:
         parent,
         open_,
         LOOK_OUT,
-        1.5,
-        0.40,
-        min(100_000, large),
-        0.75,
-        large,
+        round(params.border_reach * MM),
+        params.border_drop,
+        params.border_share,
+        params.smallest_patch,
+        round(params.largest_building * MM),
     )
-    after = np.empty_like(state)
+    spread_roofs(width, height, cell, pos, state, patch, planes, squares, AGREE)
+
+
+def _grow(cells: Cells, params: RobustParams) -> npt.NDArray[np.uint8]:
+    """Grow the references over the low points in synchronous passes (step 7); return the new state."""
+    limit = round(params.search_radius * MM)
+    state, after = cells.state, np.empty_like(cells.state)
     for _ in range(params.passes):
-        if not grow(width, cell, pos, state, rings, limit * limit, after):
+        changed = grow(
+            cells.width,
+            cells.cell,
+            cells.pos,
+            state,
+            -(-limit // cells.cell),
+            limit * limit,
+            params.growth_base,
+            params.growth_spread,
+            params.growth_slope,
+            params.growth_step,
+            params.growth_spread,
+            1.5,
+            NO_ROUGHNESS,
+            0.0,
+            0.0,
+            1,
+            after,
+        )
+        if not changed:
             break
         state, after = after, state
-    if params.clean:
-        clean(width, cell, pos, state, rings, limit * limit, after)
-        state = after
-    fixed = cloud.fixed if cloud.fixed is not None else np.empty(0, np.bool_)
+    return state
+
+
+def _label(
+    cloud: Cloud, cells: Cells, state: npt.NDArray[np.uint8], rough: npt.NDArray[np.int32], params: RobustParams
+) -> Verdict:
+    """Second growth over halved cells where the cloud is sparse (step 10), then the labels (step 11)."""
+    limit = round(params.search_radius * MM)
+    known, pos, width, cell, parts = state, cells.pos, cells.width, cells.cell, 1
+    if params.refinement == 2 and "refinement" in params.steps:
+        pos, state = halve(
+            cloud.x,
+            cloud.y,
+            cloud.z,
+            cells.x0,
+            cells.y0,
+            cells.of_point,
+            pos,
+            cells.floor,
+            state,
+            width,
+            cells.height,
+            cell,
+        )
+        width, cell, parts = 2 * width, cell // 2, 2
+        state = _grow_fine(width, cell, pos, state, rough, params)
+    ground, unproven = np.empty(cloud.n_core, np.bool_), np.empty(cloud.n_core, np.bool_)
     label(
         cloud.x,
         cloud.y,
         cloud.z,
-        fixed,
+        NO_POINTS if cloud.fixed is None else cloud.fixed,
         cloud.n_core,
         cells.x0,
         cells.y0,
         cells.of_point,
+        cells.floor,
+        known,
+        rough,
+        parts,
         width,
         cell,
         pos,
-        cells.floor,
         state,
-        rings,
+        -(-limit // cell),
         limit * limit,
         params.tolerance,
+        params.roughness,
+        params.label_spread,
+        params.label_slope,
         ground,
         unproven,
     )
     return Verdict(ground, unproven)
+
+
+def _grow_fine(
+    width: int,
+    cell: int,
+    pos: npt.NDArray[np.int32],
+    state: npt.NDArray[np.uint8],
+    rough: npt.NDArray[np.int32],
+    params: RobustParams,
+) -> npt.NDArray[np.uint8]:
+    """Growth over the finer cells with a tolerance that follows the roughness, and its cleaning (step 10)."""
+    limit = round(params.search_radius * MM)
+    rings, after = -(-limit // cell), np.empty_like(state)
+    for _ in range(params.fine_passes):
+        grow(
+            width,
+            cell,
+            pos,
+            state,
+            rings,
+            limit * limit,
+            params.fine_base,
+            params.fine_spread,
+            params.fine_slope,
+            params.fine_step,
+            params.fine_spread,
+            2.0,
+            rough,
+            params.fine_roughness,
+            ROUGH_MOST,
+            2,
+            after,
+        )
+        state, after = after, state
+    if "cleaning" in params.steps:
+        clean(width, cell, pos, state, rings, limit * limit, True, np.empty(len(state), np.int32), after)
+        state = after
+    return state

@@ -1,4 +1,4 @@
-"""Growth of the references over the low points and one cleaning round (steps 7 and 8)."""
+"""Growth of the references over low points and one cleaning round (steps 7, 8 and 10)."""
 
 from __future__ import annotations
 
@@ -7,42 +7,16 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, UNPROVEN
+from ppdf_dask.filters.ppdf.compiled import leaf
+from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, ROOF, UNPROVEN
 from ppdf_dask.filters.ppdf.robust.surface import height_above, nearest
 
-
-@njit(nogil=True, cache=True)
-def grow(width: Any, cell: Any, pos: Any, state: Any, rings: Any, limit2: Any, after: Any) -> Any:
-    """One synchronous pass: `after` gets the new state; return how many states changed."""
-    found = np.empty(4, np.int64)
-    soft = 0.1 * (cell * 1e-3) ** 2
-    changed = 0
-    for k in range(len(state)):
-        s = state[k]
-        after[k] = s
-        if not s & LOW or s & (REF | UNPROVEN) == REF:
-            continue
-        x, y, z = np.int64(pos[k, 0]), np.int64(pos[k, 1]), np.int64(pos[k, 2])
-        unknown = nearest_others(state, pos, width, cell, k, x, y, rings, limit2, found)
-        n, r, slope, d, step = height_above(pos, x, y, z, found, soft)
-        by_plane = n > 0 and -(8.0 + 0.15 * d) < r < min(1.5, 0.3 + (0.15 + 0.4 * slope) * d)
-        by_step = n > 0 and r > 0.0 and step < 0.3 + 0.15 * d and not s & DROPPED
-        if by_plane or (by_step and not s & MAYBE_DROPPED):
-            s = (s | REF) & ~UNPROVEN
-            if unknown:
-                s |= UNPROVEN
-        elif by_step:
-            s |= REF | UNPROVEN
-        elif unknown:
-            s |= UNPROVEN
-        if s != state[k]:
-            changed += 1
-            after[k] = s
-    return changed
+NOT_KNOWN = np.int32(-(2**31))
+"""A residual or roughness that does not exist or is not proven."""
 
 
-@njit(nogil=True, cache=True)
-def nearest_others(
+@leaf
+def _nearest_others(
     state: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, rings: Any, limit2: Any, found: Any
 ) -> Any:
     """`nearest`, but blind to cell `k` itself."""
@@ -54,19 +28,87 @@ def nearest_others(
 
 
 @njit(nogil=True, cache=True)
-def clean(width: Any, cell: Any, pos: Any, state: Any, rings: Any, limit2: Any, after: Any) -> None:
-    """Re-test every reference without itself: `after` gets the new state."""
+def grow(
+    width: Any,
+    cell: Any,
+    pos: Any,
+    state: Any,
+    rings: Any,
+    limit2: Any,
+    base: Any,
+    spread: Any,
+    slope_factor: Any,
+    step_limit: Any,
+    step_spread: Any,
+    highest: Any,
+    rough: Any,
+    rough_factor: Any,
+    rough_most: Any,
+    parts: Any,
+    after: Any,
+) -> Any:
+    """Do one synchronous pass: `after` gets the new state; return how many states changed.
+
+    `rough` holds the roughness (mm) of the coarse cells, `parts` x `parts` of these cells make one of them; an empty
+    array stands for none.
+    """
+    found = np.empty(4, np.int64)
+    soft = 0.1 * (cell * 1e-3) ** 2
+    changed = 0
+    for k in range(len(state)):
+        s = state[k]
+        after[k] = s
+        if not s & LOW or s & ROOF or s & (REF | UNPROVEN) == REF:
+            continue
+        x, y, z = np.int64(pos[k, 0]), np.int64(pos[k, 1]), np.int64(pos[k, 2])
+        unknown = _nearest_others(state, pos, width, cell, k, x, y, rings, limit2, found)
+        n, r, slope, d, step = height_above(pos, x, y, z, found, soft)
+        least = most = 0.0
+        if len(rough) > 0:
+            here = rough[k // width // parts * (width // parts) + k % width // parts]
+            least = rough_factor * (0.0 if here == NOT_KNOWN else here * 1e-3)
+            most = rough_factor * (rough_most if here == NOT_KNOWN else here * 1e-3)
+        above = -(8.0 + 0.15 * d) < r
+        rise = base + (spread + slope_factor * slope) * d
+        by_plane = n > 0 and above and r < min(highest, rise + least)
+        perhaps = n > 0 and above and r < min(highest, rise + most)
+        by_step = n > 0 and r > 0.0 and step < step_limit + step_spread * d and not s & DROPPED
+        if by_plane or by_step:
+            s = (s | REF) & ~UNPROVEN
+            if unknown or s & MAYBE_DROPPED:
+                s |= UNPROVEN
+        elif unknown or perhaps:
+            s |= UNPROVEN
+        if s != state[k]:
+            changed += 1
+            after[k] = s
+    return changed
+
+
+@njit(nogil=True, cache=True)
+def clean(
+    width: Any, cell: Any, pos: Any, state: Any, rings: Any, limit2: Any, drop: Any, residuals: Any, after: Any
+) -> None:
+    """Re-test every reference without itself.
+
+    `after` gets the new state, `residuals` the heights (mm) of those that stay. Without `drop` only the residuals are
+    taken.
+    """
     found = np.empty(4, np.int64)
     soft = 0.1 * (cell * 1e-3) ** 2
     for k in range(len(state)):
         s = state[k]
         after[k] = s
-        if not s & REF or s & FIXED:
+        residuals[k] = NOT_KNOWN
+        if not s & REF:
             continue
         x, y, z = np.int64(pos[k, 0]), np.int64(pos[k, 1]), np.int64(pos[k, 2])
-        unknown = nearest_others(state, pos, width, cell, k, x, y, rings, limit2, found)
+        unknown = _nearest_others(state, pos, width, cell, k, x, y, rings, limit2, found)
         n, r, slope, d, _step = height_above(pos, x, y, z, found, soft)
-        if n >= 3 and r > 0.3 + (0.2 + 1.2 * slope) * d:
-            after[k] = s & ~REF
+        if n >= 3:
+            if drop and not s & FIXED and r > 0.3 + (0.2 + 1.2 * slope) * d:
+                after[k] = s & ~REF
+            else:
+                residuals[k] = np.int32(np.rint(min(max(r, -1000.0), 1000.0) * 1000.0))
         if unknown:
             after[k] |= UNPROVEN

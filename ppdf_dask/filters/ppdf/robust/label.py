@@ -1,4 +1,4 @@
-"""The label of every core point (step 9)."""
+"""The label of every core point (step 11)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
+from ppdf_dask.filters.ppdf.robust.growth import NOT_KNOWN
 from ppdf_dask.filters.ppdf.robust.surface import height_above, nearest
 
 
@@ -21,41 +22,59 @@ def label(
     x0: Any,
     y0: Any,
     of_point: Any,
+    floor: Any,
+    known: Any,
+    rough: Any,
+    parts: Any,
     width: Any,
     cell: Any,
     pos: Any,
-    floor: Any,
     state: Any,
     rings: Any,
     limit2: Any,
     tolerance: Any,
+    rough_factor: Any,
+    spread: Any,
+    slope_factor: Any,
     ground: Any,
     unproven: Any,
 ) -> None:
-    """Set `ground` and `unproven` of the core points."""
+    """Set `ground` and `unproven` of the core points.
+
+    `of_point`, `floor`, `known` (their states) and `rough` speak of the coarse cells; `width`, `cell`, `pos` and
+    `state` of the fine ones, `parts` x `parts` to a coarse one.
+    """
     found = np.empty(4, np.int64)
     soft = 0.1 * (cell * 1e-3) ** 2
     for i in range(n_core):
-        k = of_point[i]
-        s = state[k]
         ground[i] = False
         unproven[i] = False
         if len(fixed) > 0 and fixed[i]:
             ground[i] = True
             continue
-        if not s & LOW:
-            unproven[i] = s & UNPROVEN
+        big = of_point[i]
+        if not known[big] & LOW:
+            unproven[i] = (known[big] & UNPROVEN) != 0
             continue
-        if z[i] <= floor[k]:
+        if z[i] <= floor[big]:
             continue
         xi, yi, zi = np.int64(x[i]) - x0, np.int64(y[i]) - y0, np.int64(z[i])
+        k = big
+        if parts > 1:
+            k = yi // cell * width + xi // cell
         if zi == pos[k, 2] and xi == pos[k, 0] and yi == pos[k, 1]:
-            ground[i] = s & REF
-            unproven[i] = s & UNPROVEN
+            ground[i] = (state[k] & REF) != 0
+            unproven[i] = (state[k] & UNPROVEN) != 0
             continue
         if zi - pos[k, 2] >= 5000:
             continue
-        unproven[i] = nearest(state, pos, width, cell, k, xi, yi, rings, limit2, found)
+        unknown = nearest(state, pos, width, cell, k, xi, yi, rings, limit2, found)
         n, r, slope, d, _step = height_above(pos, xi, yi, zi, found, soft)
-        if n > 0:
-            ground[i] = -(3.0 + slope * d) < r < tolerance + (0.1 + 0.5 * slope) * d
+        if n > 0 and r > -(3.0 + slope * d):
+            rise = (spread + slope_factor * slope) * d
+            if rough[big] == NOT_KNOWN:
+                ground[i] = r < tolerance + rise
+                unknown |= ground[i] != (r < 4.0 * tolerance + rise)
+            else:
+                ground[i] = r < min(4.0 * tolerance, tolerance + rough_factor * rough[big] * 1e-3) + rise
+        unproven[i] = unknown

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, UNPROVEN
+from ppdf_dask.filters.ppdf.compiled import leaf
+from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, ROOF, UNPROVEN
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def residual(planes: Any, squares: Any, p: Any, pos: Any, k: Any, cell: Any) -> Any:
     """Height of the low point of cell `k` above plane `p`, metres."""
     x = (pos[k, 0] - squares[p, 0] * cell) * 1e-3
@@ -19,7 +20,7 @@ def residual(planes: Any, squares: Any, p: Any, pos: Any, k: Any, cell: Any) -> 
     return z - (planes[p, 2] + planes[p, 0] * x + planes[p, 1] * y)
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _root(parent: Any, p: Any) -> Any:
     while parent[p] != p:
         parent[p] = parent[parent[p]]
@@ -94,15 +95,17 @@ def judge_components(
     count: Any,
     parent: Any,
     open_: Any,
+    look_out: Any,
     reach: Any,
-    step: Any,
+    drop: Any,
     share: Any,
-    small: Any,
-    share_large: Any,
-    large: Any,
+    smallest: Any,
+    largest: Any,
 ) -> None:
-    """Drop the seeds of components that stand above their surroundings."""
-    tally = np.zeros((count, 3), np.int64)
+    """Drop the seeds of components that are too small or whose border drops away on most sides."""
+    seeds = np.zeros(count, np.int64)
+    borders = np.zeros(count, np.int64)
+    drops = np.zeros(count, np.int64)
     box = np.empty((count, 4), np.int64)
     box[:, 0:2] = 1 << 40
     box[:, 2:4] = -1
@@ -112,6 +115,7 @@ def judge_components(
         if p < 0:
             continue
         root = parent[p]
+        seeds[root] += 1
         if open_[p]:
             open_[root] = True
         row, col = k // width, k % width
@@ -119,35 +123,61 @@ def judge_components(
         box[root, 1] = min(box[root, 1], row)
         box[root, 2] = max(box[root, 2], col)
         box[root, 3] = max(box[root, 3], row)
+        tilt = np.sqrt(planes[p, 0] ** 2 + planes[p, 1] ** 2)
         for direction in range(4):
-            lowest = np.inf
+            met = False
+            falls = False
             j = k
-            for _ in range(reach):
+            for far in range(1, look_out + 1):
                 j += shift[direction]
                 if patch[j] >= 0 and parent[patch[j]] == root:
-                    lowest = np.inf
+                    met = False
                     break
                 if state[j] & UNPROVEN:
                     open_[root] = True
                 if state[j] & LOW:
-                    lowest = min(lowest, residual(planes, squares, p, pos, j, cell))
-            if lowest < np.inf:
-                tally[root, 0 if lowest < -step else (1 if lowest > step else 2)] += 1
+                    met = True
+                    if far * cell <= reach and not falls:
+                        fall = drop + 0.5 * tilt * far * (cell * 1e-3)
+                        falls = residual(planes, squares, p, pos, j, cell) < -fall
+            if met:
+                borders[root] += 1
+                drops[root] += falls
     verdict = np.zeros(count, np.uint8)
     for p in range(count):
-        if parent[p] != p or box[p, 2] < 0:
+        if parent[p] != p:
             continue
-        side = max(box[p, 2] - box[p, 0], box[p, 3] - box[p, 1]) + 1
-        side *= cell
-        total = tally[p, 0] + tally[p, 1] + tally[p, 2]
+        side = (max(box[p, 2] - box[p, 0], box[p, 3] - box[p, 1]) + 1) * cell
         if open_[p]:
-            if side < max(small, large):
+            if side < largest or seeds[p] < smallest:
                 verdict[p] = UNPROVEN | MAYBE_DROPPED
-        elif (tally[p, 0] > share * total and side < small) or (tally[p, 0] > share_large * total and side < large):
+        elif seeds[p] < smallest:
             verdict[p] = DROPPED
+        elif drops[p] > share * borders[p] and side < largest:
+            verdict[p] = ROOF
     for k in range(len(state)):
         if patch[k] >= 0 and not state[k] & FIXED:
             v = verdict[parent[patch[k]]]
-            if v & DROPPED:
+            if v & (DROPPED | ROOF):
                 state[k] &= ~REF
             state[k] |= v
+
+
+@njit(nogil=True, cache=True)
+def spread_roofs(
+    width: Any, height: Any, cell: Any, pos: Any, state: Any, patch: Any, planes: Any, squares: Any, agree: Any
+) -> None:
+    """Make roof of the low points beside a roof's seeds and near their plane: chimneys, edges, what no plane took."""
+    mark = np.zeros(len(state), np.uint8)
+    for row in range(1, height - 1):
+        for k in range(row * width + 1, row * width + width - 1):
+            if not state[k] & LOW or state[k] & (REF | ROOF):
+                continue
+            for dr in range(-1, 2):
+                for j in range(k + dr * width - 1, k + dr * width + 2):
+                    if state[j] & UNPROVEN:
+                        mark[k] |= MAYBE_DROPPED
+                    if state[j] & ROOF and abs(residual(planes, squares, patch[j], pos, k, cell)) < agree:
+                        mark[k] |= ROOF
+    for k in range(len(state)):
+        state[k] |= mark[k]

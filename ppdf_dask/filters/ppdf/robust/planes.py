@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from ppdf_dask.filters.ppdf.compiled import leaf
 from ppdf_dask.filters.ppdf.hashing import below, cell_seed
 from ppdf_dask.filters.ppdf.robust.cells import FIXED, LOW, MAYBE_DROPPED, REF, SQUARE, UNPROVEN
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def _fit(xs: Any, ys: Any, zs: Any, n: Any, seed: Any, trials: Any, t_in: Any, best: Any) -> Any:
     """Find the plane with the best score; return whether there is one, `best` gets (a, b, height at 0, 0)."""
     best_score = -(1 << 30)
@@ -47,43 +48,6 @@ def _fit(xs: Any, ys: Any, zs: Any, n: Any, seed: Any, trials: Any, t_in: Any, b
 
 
 @njit(nogil=True, cache=True)
-def _refit(xs: Any, ys: Any, zs: Any, n: Any, t_in: Any, best: Any) -> None:
-    """Least squares over the inliers of `best`, kept when its slope stays below 1."""
-    a, b, h = best[0], best[1], best[2]
-    limit = t_in * np.sqrt(1.0 + a * a + b * b)
-    cnt = 0
-    xm = ym = zm = 0.0
-    for m in range(n):
-        if abs(zs[m] - (h + a * xs[m] + b * ys[m])) <= limit:
-            cnt += 1
-            xm += xs[m]
-            ym += ys[m]
-            zm += zs[m]
-    if cnt < 3:
-        return
-    xm /= cnt
-    ym /= cnt
-    zm /= cnt
-    sxx = sxy = syy = sxz = syz = 0.0
-    for m in range(n):
-        if abs(zs[m] - (h + a * xs[m] + b * ys[m])) <= limit:
-            dx, dy, dz = xs[m] - xm, ys[m] - ym, zs[m] - zm
-            sxx += dx * dx
-            sxy += dx * dy
-            syy += dy * dy
-            sxz += dx * dz
-            syz += dy * dz
-    det = sxx * syy - sxy * sxy
-    if det < 1e-6 * (sxx + syy) ** 2 + 1e-9:
-        return
-    a = (sxz * syy - syz * sxy) / det
-    b = (syz * sxx - sxz * sxy) / det
-    if a * a + b * b > 1.0:
-        return
-    best[0], best[1], best[2] = a, b, zm - a * xm - b * ym
-
-
-@njit(nogil=True, cache=True)
 def find_planes(
     width: Any,
     height: Any,
@@ -94,7 +58,6 @@ def find_planes(
     planes: Any,
     squares: Any,
     trials: Any,
-    refits: Any,
     t_in: Any,
     share: Any,
     division: Any,
@@ -144,8 +107,6 @@ def find_planes(
                 split = True
                 seed = cell_seed(c0 - col0, r0 - row0, size)
                 if _fit(xs, ys, zs, n, seed, trials, t_in, best):
-                    for _ in range(refits):
-                        _refit(xs, ys, zs, n, t_in, best)
                     a, b, h = best[0], best[1], best[2]
                     norm = np.sqrt(1.0 + a * a + b * b)
                     inside = 0

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from ppdf_dask.filters.ppdf.compiled import leaf
 from ppdf_dask.filters.ppdf.robust.cells import REF, UNPROVEN
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def nearest(
     state: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, rings: Any, limit2: Any, found: Any
 ) -> Any:
@@ -72,7 +72,7 @@ def nearest(
     return (seen & UNPROVEN) != 0
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def before(pos: Any, j: Any, k: Any) -> Any:
     """Tell whether the low point of cell `j` comes before that of `k` in the order (z, x, y)."""
     if pos[j, 2] != pos[k, 2]:
@@ -82,7 +82,7 @@ def before(pos: Any, j: Any, k: Any) -> Any:
     return pos[j, 1] < pos[k, 1]
 
 
-@njit(nogil=True, cache=True)
+@leaf
 def height_above(pos: Any, x: Any, y: Any, z: Any, found: Any, soft: Any) -> Any:
     """Return (count, height above the surface, slope, distance and height above the nearest reference), metres."""
     n = 0

@@ -1,0 +1,60 @@
+"""The finer cells of the second growth (step 10)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from ppdf_dask.filters.ppdf.robust.cells import DROPPED, LOW, MAYBE_DROPPED, ROOF
+
+
+@njit(nogil=True, cache=True)
+def halve(
+    x: Any,
+    y: Any,
+    z: Any,
+    x0: Any,
+    y0: Any,
+    of_point: Any,
+    pos: Any,
+    floor: Any,
+    state: Any,
+    width: Any,
+    height: Any,
+    cell: Any,
+) -> Any:
+    """Cut each cell in four and take their lowest points; return their positions and states.
+
+    The low point of the cell keeps its state; the others start as candidates, and as roof where the cell's is.
+    """
+    half = cell // 2
+    wide = 2 * width
+    fine_pos = np.zeros((wide * 2 * height, 3), np.int32)
+    fine = np.zeros(wide * 2 * height, np.uint8)
+    for i in range(len(x)):
+        k = of_point[i]
+        if not state[k] & LOW or z[i] <= floor[k]:
+            continue
+        xi = x[i] - x0
+        yi = y[i] - y0
+        f = yi // half * wide + xi // half
+        if fine[f]:
+            if z[i] > fine_pos[f, 2]:
+                continue
+            if z[i] == fine_pos[f, 2] and (xi > fine_pos[f, 0] or (xi == fine_pos[f, 0] and yi >= fine_pos[f, 1])):
+                continue
+        fine_pos[f, 0] = xi
+        fine_pos[f, 1] = yi
+        fine_pos[f, 2] = z[i]
+        fine[f] = LOW | (state[k] & (DROPPED | ROOF | MAYBE_DROPPED))
+    for k in range(len(state)):
+        if state[k] & LOW:
+            f = pos[k, 1] // half * wide + pos[k, 0] // half
+            fine[f] = state[k]
+            fine_pos[f] = pos[k]
+        elif state[k]:
+            f = k // width * 2 * wide + k % width * 2
+            fine[f] = fine[f + 1] = fine[f + wide] = fine[f + wide + 1] = state[k]
+    return fine_pos, fine
