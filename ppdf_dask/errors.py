@@ -37,6 +37,33 @@ class StoreError(PpdfError):
     """The run's store is missing, incomplete, torn or belongs to another run."""
 
 
+class DamagedError(StoreError):
+    """An object of the store is missing, torn, flipped or not what the ledger says.
+
+    Attributes
+    ----------
+    path : str
+        The object's path in the store; it tells which work has to be done again.
+    """
+
+    def __init__(self, message: str, path: str = "") -> None:
+        super().__init__(message, path)
+        self.path = path
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+class DiskFullError(StoreError):
+    """There is no room, or no leave to write; the message says where. The same command goes on once there is."""
+
+
+class LockedError(StoreError):
+    """Another run works in the same folder; the message names who and where."""
+
+    exit_code = 2
+
+
 class ResumeError(StoreError):
     """Inputs, parameters or versions differ from those of the existing run; the message shows old and new."""
 

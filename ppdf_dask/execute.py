@@ -1,18 +1,26 @@
-"""One stage on a cluster: a bounded window of futures, retries, failures collected by name.
+"""One stage on a cluster: a bounded window of futures, retries, the culprit alone, failures by name.
 
 Neither the client nor the scheduler ever holds more than the window, so their memory does not grow with the survey.
 Keys are ``<stage>-<id>-<token>``: the dashboard groups by stage, ids can be searched, two runs do not collide.
+
+A piece of work that raises something unforeseen is tried again; one that says in plain words what is wrong (a
+`PpdfError`) would say it again and is not. When a worker dies, Dask blames every task that was on it: such work is
+tried again at the end of the stage, one piece at a time, so that only the culprit is given up.
 """
 
 from __future__ import annotations
 
+import contextlib
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-from ppdf_dask.errors import ClusterError
-from ppdf_dask.events import Event, Listener, State
+from ppdf_dask.errors import ClusterError, DamagedError, DiskFullError, PpdfError
+from ppdf_dask.events import Event, Listener
+from ppdf_dask.quarantine import Failure
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -22,6 +30,9 @@ RETRIES = 2
 
 WINDOW_PER_THREAD = 3
 """Futures in flight per worker thread: one running, the next ones already there."""
+
+POLL = 1.0
+"""Seconds between two looks at scheduler and lock while no result comes."""
 
 
 @dataclass(frozen=True)
@@ -36,31 +47,14 @@ class Work:
         What it counts for in the progress.
     job : object
         First argument after the store's path; small, picklable.
+    fingerprint : str
+        What its record is published with.
     """
 
     ident: str
     points: int
     job: Any
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A piece of work that could not be done.
-
-    Attributes
-    ----------
-    stage, ident : str
-        What it was.
-    error : str
-        The message in plain words.
-    detail : str
-        The traceback, for a bug report.
-    """
-
-    stage: str
-    ident: str
-    error: str
-    detail: str
+    fingerprint: str
 
 
 @dataclass(frozen=True)
@@ -73,7 +67,7 @@ class Stage:
         As in the ledger and on the dashboard.
     function : callable
         ``function(url, job, fingerprint) -> record``.
-    url, fingerprint : str
+    url : str
         Passed through.
     token : str
         Tells the keys of this run from those of another on the same scheduler.
@@ -82,24 +76,124 @@ class Stage:
     name: str
     function: Callable[..., dict[str, Any]]
     url: str
-    fingerprint: str
     token: str
 
-    def submit(self, client: Client, work: Work) -> Future[dict[str, Any]]:
+
+@dataclass
+class _Flight:
+    """The work of one stage on its way."""
+
+    client: Client
+    stage: Stage
+    on_event: Listener
+    check: Callable[[], None]
+    arrived: SimpleQueue[Future[dict[str, Any]]] = field(default_factory=SimpleQueue)
+    flying: dict[str, tuple[Work, Future[dict[str, Any]]]] = field(default_factory=dict)
+    tries: dict[str, int] = field(default_factory=dict)
+    suspects: list[Work] = field(default_factory=list)
+    room: int = 0
+    asked: float = float("-inf")
+
+    def submit(self, work: Work) -> None:
         """Send one piece of work to the cluster."""
-        return client.submit(
-            self.function,
-            self.url,
-            work.job,
-            self.fingerprint,
-            key=f"{self.name}-{work.ident}-{self.token}",
-            retries=RETRIES,
-            pure=False,
+        tries = self.tries[work.ident] = self.tries.get(work.ident, 0) + 1
+        key = f"{self.stage.name}-{work.ident}-{self.stage.token}" + (f"-{tries}" if tries > 1 else "")
+        with self._cluster_faults(work):
+            future = self.client.submit(
+                self.stage.function, self.stage.url, work.job, work.fingerprint, key=key, pure=False
+            )
+        self.flying[key] = (work, future)
+        future.add_done_callback(self.arrived.put)
+
+    def window(self) -> int:
+        """Return how many pieces may fly; the cluster is asked once a second at most."""
+        now = time.monotonic()
+        if now >= self.asked + POLL:
+            with self._cluster_faults(None):
+                self.room = max(4, WINDOW_PER_THREAD * sum(self.client.nthreads().values()))
+            self.asked = now
+        return self.room
+
+    def land(self) -> tuple[Work, dict[str, Any] | Failure] | None:
+        """Wait for one piece; return its record or failure, None when it is to fly again."""
+        while True:
+            try:
+                future = self.arrived.get(timeout=POLL)
+                break
+            except Empty:
+                self.check()
+                if self.client.status != "running":
+                    raise self._lost(None) from None
+        work, _ = self.flying.pop(str(future.key))
+        if future.status not in ("finished", "error"):
+            raise self._lost(work)
+        with self._cluster_faults(work):
+            if future.status == "finished":
+                record: dict[str, Any] = future.result()
+                return work, record
+            error, trace = future.exception(), future.traceback()
+        future.release()
+        return self._judge(work, error, trace)
+
+    def _judge(self, work: Work, error: Any, trace: Any) -> tuple[Work, Failure] | None:
+        if isinstance(error, DiskFullError):
+            raise error
+        killed = type(error).__name__ == "KilledWorker"
+        if not isinstance(error, PpdfError) and self.tries[work.ident] <= (1 if killed else RETRIES):
+            reason = "its worker died" if killed else f"{type(error).__name__}: {error}"
+            self.on_event(Event(self.stage.name, "retried", work.ident, record={"error": reason}))
+            if killed:
+                self.suspects.append(work)
+            else:
+                self.submit(work)
+            return None
+        text = str(error) or type(error).__name__
+        if killed:
+            text = "ended its worker each time it was tried, also alone: most often for want of memory"
+        elif not isinstance(error, PpdfError):
+            text = f"{type(error).__name__}: {text}"
+        detail = "".join(traceback.format_exception(type(error), error, trace))
+        damaged = error.path if isinstance(error, DamagedError) else ""
+        return work, Failure(self.stage.name, work.ident, text, detail, damaged)
+
+    @contextlib.contextmanager
+    def _cluster_faults(self, work: Work | None) -> Iterator[None]:
+        """Name a lost scheduler as what it is."""
+        try:
+            yield
+        except (OSError, TimeoutError, RuntimeError) as error:
+            raise self._lost(work) from error
+        except Exception as error:
+            if type(error).__name__ in ("CancelledError", "FutureCancelledError", "FuturesCancelledError"):
+                raise self._lost(work) from error
+            raise
+
+    def _lost(self, work: Work | None) -> ClusterError:
+        scheduler = self.client.scheduler
+        return ClusterError(
+            f"the scheduler at {scheduler.address if scheduler else '?'} was lost during {self.stage.name}"
+            f"{f' {work.ident}' if work else ''}; start it again and give the same command, it goes on where it stopped"
         )
+
+    def abandon(self) -> None:
+        """Let go of what still flies."""
+        futures = [future for _, future in self.flying.values()]
+        self.flying.clear()
+        if futures and self.client.status == "running":
+            with contextlib.suppress(Exception):
+                self.client.cancel(futures, force=True)
+
+
+def nothing() -> None:
+    """Check nothing."""
 
 
 def execute(
-    client: Client, stage: Stage, todo: Iterable[Work], on_event: Listener
+    client: Client,
+    stage: Stage,
+    todo: Iterable[Work],
+    on_event: Listener,
+    check: Callable[[], None] = nothing,
 ) -> Iterator[tuple[Work, dict[str, Any] | Failure]]:
     """Run a stage's work and yield each record, or failure, as it comes.
 
@@ -113,50 +207,37 @@ def execute(
         Taken as workers get free, in this order.
     on_event : callable
         Hears of each piece of work.
+    check : callable
+        Called about once a second; what it raises ends the stage.
 
     Raises
     ------
     ClusterError
         The scheduler was lost; what is done is in the ledger.
+    DiskFullError
+        There is no room: everything else would fail as well.
     """
-    from distributed import as_completed
-
+    flight = _Flight(client, stage, on_event, check)
     waiting = iter(todo)
-    flying: dict[Any, Work] = {}
-    finished = as_completed(with_results=True, raise_errors=False)
-
-    def fill() -> None:
-        window = max(4, WINDOW_PER_THREAD * sum(client.nthreads().values()))
-        while len(flying) < window and (work := next(waiting, None)) is not None:
-            future = stage.submit(client, work)
-            flying[future.key] = work
-            finished.add(future)
-
-    fill()
-    for future, result in finished:
-        work = flying.pop(future.key)
-        status = future.status
-        if status in ("cancelled", "lost"):
-            raise ClusterError(
-                f"the scheduler at {client.scheduler.address if client.scheduler else '?'} was lost during "
-                f"{stage.name} {work.ident}; start it again and give the same command, it goes on where it stopped"
-            )
-        outcome = _failure(stage.name, work.ident, result) if status == "error" else result
-        future.release()
-        state: State = "failed" if isinstance(outcome, Failure) else "done"
-        record = {"error": outcome.error} if isinstance(outcome, Failure) else outcome
-        on_event(Event(stage.name, state, work.ident, work.points, record=record))
-        fill()
-        yield work, outcome
-
-
-def _failure(stage: str, ident: str, result: Any) -> Failure:
-    error = result[1] if isinstance(result, tuple) else result
-    detail = "".join(traceback.format_exception(*result)) if isinstance(result, tuple) else repr(error)
-    text = str(error) or type(error).__name__
-    if type(error).__name__ == "KilledWorker":
-        text = (
-            f"{stage} {ident} ended its worker {getattr(error, 'allowed_failures', 3) + 1} times, most often for want "
-            "of memory; give a smaller --chunk-size or workers with more memory"
-        )
-    return Failure(stage, ident, text, detail)
+    try:
+        while True:
+            room = flight.window() - len(flight.flying)
+            while room > 0 and (work := next(waiting, None)) is not None:
+                flight.submit(work)
+                room -= 1
+            if not flight.flying:
+                if not flight.suspects:
+                    return
+                flight.submit(flight.suspects.pop(0))
+            landed = flight.land()
+            if landed is None:
+                continue
+            work, outcome = landed
+            check()
+            if isinstance(outcome, Failure):
+                on_event(Event(stage.name, "failed", work.ident, work.points, record={"error": outcome.error}))
+            else:
+                on_event(Event(stage.name, "done", work.ident, work.points, record=outcome))
+            yield work, outcome
+    finally:
+        flight.abandon()

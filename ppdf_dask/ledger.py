@@ -84,11 +84,22 @@ class Ledger:
         """Write the record that says this piece of work is done; always the last write of a task."""
         self.store.put_record(stage, ident, {"fingerprint": fingerprint, **record})
 
-    def done(self, stage: Stage, fingerprint: str) -> dict[str, dict[str, Any]]:
-        """Return the records of a stage that were made with this fingerprint."""
-        return {
-            ident: record for ident, record in self.store.records(stage) if record.get("fingerprint") == fingerprint
-        }
+    def done(self, stage: Stage, wanted: dict[str, str]) -> dict[str, dict[str, Any]]:
+        """Return the records of a stage that count.
+
+        Parameters
+        ----------
+        stage : str
+            The stage.
+        wanted : dict
+            Id to the fingerprint its record must carry.
+        """
+        found = {}
+        for ident, fingerprint in wanted.items():
+            record = self.store.get_record(stage, ident)
+            if record is not None and record.get("fingerprint") == fingerprint:
+                found[ident] = record
+        return found
 
 
 def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:

@@ -40,15 +40,18 @@ class MergeJob:
         As the file was cut.
     target : str
         Path of the classified file.
+    made_by : str or None
+        Fingerprint the classifications must carry; None: any.
     """
 
     tile: TileJob
     target: str
+    made_by: str | None = None
 
 
 def write_tile(store: RunStore, job: MergeJob) -> dict[str, Any]:
     """Write one classified tile of a run; see `rewrite`."""
-    masks = _Masks(store, job.tile)
+    masks = _Masks(store, job.tile, job.made_by)
     record = rewrite(job.tile, Path(job.target), masks.ground)
     masks.check_used_up()
     return record
@@ -152,8 +155,8 @@ def _verify(part: Path, meant: _Histogram) -> None:
 class _Masks:
     """The masks of the chunks a file touches, each read once, walked through in file order."""
 
-    def __init__(self, store: RunStore, job: TileJob) -> None:
-        self._store, self._job = store, job
+    def __init__(self, store: RunStore, job: TileJob, made_by: str | None = None) -> None:
+        self._store, self._job, self._made_by = store, job, made_by
         self._masks: dict[str, Bools] = {}
         self._used: dict[str, int] = {}
 
@@ -163,7 +166,8 @@ class _Masks:
         for ix, iy, index in owners(self._job.grid, batch.x[seen], batch.y[seen]):
             chunk = self._job.grid.chunk(ix, iy).id
             if chunk not in self._masks:
-                self._masks[chunk] = self._store.read_classification(chunk).get(self._job.source, np.zeros(0, np.bool_))
+                masks = self._store.read_classification(chunk, self._made_by)
+                self._masks[chunk] = masks.get(self._job.source, np.zeros(0, np.bool_))
                 self._used[chunk] = 0
             begin = self._used[chunk]
             self._used[chunk] = end = begin + len(index)

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ppdf_dask import filters
+from ppdf_dask.classes import check_writable
 from ppdf_dask.errors import PlanError
 from ppdf_dask.filters.cloud import Density
 from ppdf_dask.grid import MM, ChunkGrid, Rect
 from ppdf_dask.params import RunParams
 from ppdf_dask.survey import Survey, Tile
+from ppdf_dask.tiles import shown
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -91,6 +93,11 @@ class Plan:
         return _estimate(self.survey, self.grid, self.buffer, self.params.returns == "last")
 
     @property
+    def most_points(self) -> float:
+        """Points a task may load at once; a chunk with more is worked on in quarters."""
+        return max(0.0, self.memory - WORKER_MB * 1e6) / (24.0 + filters.of(self.params.filter).bytes_per_point)
+
+    @property
     def task_mb(self) -> float:
         """Expected peak of the largest task, MB, the worker itself included."""
         loaded = max((c.loaded for c in self.chunks), default=0.0)
@@ -122,7 +129,11 @@ class Plan:
         ------
         PlanError
             A task would exceed the memory of a worker, or the disk would run full; with both numbers.
+        ParameterError
+            The ground class does not fit a tile's point format.
         """
+        for tile in self.survey.tiles:
+            check_writable(self.params.classes, tile.point_format, shown(tile.path))
         if self.task_mb * 1e6 > self.memory:
             raise PlanError(
                 f"the largest chunk needs about {self.task_mb:.0f} MB but a worker has {self.memory / 1e6:.0f} MB; "
@@ -145,6 +156,7 @@ class Plan:
         on_event: Callable[[Event], None] | None = None,
         overwrite: bool = False,
         accept_changes: bool = False,
+        force_unlock: bool = False,
     ) -> Result:
         """Run the plan on a cluster; an interrupted run goes on where it stopped.
 
@@ -156,6 +168,8 @@ class Plan:
             Receives each `Event`.
         overwrite, accept_changes : bool
             Start anew; go on with changed inputs or parameters, redoing what they touch.
+        force_unlock : bool
+            Take the folder's lock from a run that is surely gone (see `ppdf_dask.lock`).
 
         Returns
         -------
@@ -171,7 +185,14 @@ class Plan:
         """
         from ppdf_dask.runner import run
 
-        return run(self, client, on_event=on_event, overwrite=overwrite, accept_changes=accept_changes)
+        return run(
+            self,
+            client,
+            on_event=on_event,
+            overwrite=overwrite,
+            accept_changes=accept_changes,
+            force_unlock=force_unlock,
+        )
 
     def facts(self) -> dict[str, Any]:
         """Return the plan as plain JSON."""

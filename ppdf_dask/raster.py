@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ppdf_dask.dtm import BLOCK, Block, Raster, rasterize_block
 from ppdf_dask.grid import MM, Rect
+from ppdf_dask.index import owns_points
 from ppdf_dask.mosaic import raster_attributes, spatial_ref
 from ppdf_dask.neighbourhood import Cut
 from ppdf_dask.params import DtmParams
@@ -80,6 +81,8 @@ def rasterize(store: RunStore, job: RasterJob) -> dict[str, Any]:
     def load(rect: Rect) -> npt.NDArray[np.int64]:
         parts = [np.empty((0, 3), np.int64)]
         for chunk in job.cut.grid.over(_clip(rect, job.cut.extent)):
+            if not owns_points(store, chunk.id):
+                continue
             points = store.read_ground(chunk.id).astype(np.int64)
             points[0] += chunk.core.x0
             points[1] += chunk.core.y0

@@ -1,32 +1,38 @@
-"""`Plan.run`: the stages in order, each from what the ledger says is left to do."""
+"""`Plan.run`: the stages in order, each from what the ledger says is left to do.
+
+A piece of work that fails does not stop the others: a tile that cannot be read makes its place unknown space, a chunk
+that fails leaves out the tiles and terrain blocks that need it. What could be done is done, what could not is listed in
+``failures.json``. Damage found on the way sends the run back to the piece that wrote the damaged object.
+"""
 
 from __future__ import annotations
 
-import json
+import dataclasses
 import os
 import platform
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ppdf_dask import __version__, filters, tasks
-from ppdf_dask.dtm import DtmGrid, Raster
-from ppdf_dask.errors import PartialRunError, PlanError
+from ppdf_dask import __version__, tasks
+from ppdf_dask.errors import PartialRunError, PlanError, SurveyError
 from ppdf_dask.events import Event, Listener, ignore
-from ppdf_dask.execute import Failure, Stage, Work, execute
+from ppdf_dask.execute import Stage, Work, execute, nothing
 from ppdf_dask.filters.cloud import Density
-from ppdf_dask.grid import MM, Rect
+from ppdf_dask.grid import MM, ChunkGrid
 from ppdf_dask.ledger import Ledger, digest
 from ppdf_dask.ledger import Stage as StageName
-from ppdf_dask.merge import MergeJob
-from ppdf_dask.neighbourhood import Cut
-from ppdf_dask.params import Parameters
+from ppdf_dask.lock import hold
 from ppdf_dask.plan import Plan
-from ppdf_dask.raster import RasterJob, create, jobs
+from ppdf_dask.quarantine import Failure, write_failures, write_json
+from ppdf_dask.raster import create
+from ppdf_dask.repair import heal, sweep, take_notes
+from ppdf_dask.saved import save_plan
+from ppdf_dask.stages import Cutting, Inputs, Records, Waiting
 from ppdf_dask.store import RunStore
-from ppdf_dask.tiler import TileJob, unpack_cells
+from ppdf_dask.tiles import shown
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -36,6 +42,9 @@ if TYPE_CHECKING:
 PACKAGES = ("dask", "distributed", "numpy", "numba", "scipy", "laspy", "lazrs", "zarr", "xarray", "pyproj")
 """Whose versions are written down with a run."""
 
+ROUNDS = 3
+"""How often a run goes back to redo damaged objects before it gives up."""
+
 
 def run(
     plan: Plan,
@@ -44,19 +53,33 @@ def run(
     on_event: Listener | None = None,
     overwrite: bool = False,
     accept_changes: bool = False,
+    force_unlock: bool = False,
 ) -> Result:
     """Run a plan; see `Plan.run`."""
     from ppdf_dask.result import Result
 
+    store = RunStore(str(plan.out / "run.zarr"))
+    if not overwrite:
+        plan = _as_before(plan, store)
     plan.check()
-    driver = _Run(plan, client, on_event or ignore)
-    driver.begin(overwrite, accept_changes)
-    driver.tile()
-    driver.classify()
-    driver.merge()
-    driver.rasterize()
-    driver.finish()
+    with hold(store, force=force_unlock) as check:
+        driver = _Run(plan, client, on_event or ignore, check)
+        driver.begin(overwrite, accept_changes)
+        for _ in range(ROUNDS):
+            if driver.go():
+                break
+        driver.finish()
     return Result(plan.out)
+
+
+def _as_before(plan: Plan, store: RunStore) -> Plan:
+    """Take the chunks of the run that is there unless the user chose some: they depend on the machine's memory."""
+    if not store.exists():
+        return plan
+    facts, chosen = store.attributes().get("facts", {}), plan.params.chunks
+    if chosen.chunk_size is None and facts.get("params", {}).get("chunks", {}).get("chunk_size", 0) is None:
+        plan = dataclasses.replace(plan, grid=ChunkGrid.from_metres(facts["chunk_size_m"]))
+    return plan
 
 
 @dataclass
@@ -66,144 +89,95 @@ class _Run:
     plan: Plan
     client: Client
     on_event: Listener
-    failures: list[Failure] = field(default_factory=list)
+    check: Callable[[], None] = nothing
+    failures: dict[tuple[str, str], Failure] = field(default_factory=dict)
+    waiting: list[Waiting] = field(default_factory=list)
+    damaged: list[str] = field(default_factory=list)
     totals: dict[str, dict[str, Any]] = field(default_factory=dict)
+    chunks: Records = field(default_factory=dict)
+    merged: Records = field(default_factory=dict)
+    blocks: Records = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.store = RunStore(str(self.plan.out / "run.zarr"))
         self.ledger = Ledger(self.store)
-        self.sources = {f"s_{k:06d}": tile for k, tile in enumerate(self.plan.survey.tiles)}
+        self.inputs = Inputs(self.plan)
 
     # -- what is run ----------------------------------------------------------------------------------------------
 
     def begin(self, overwrite: bool, accept_changes: bool) -> None:
         """Open the ledger; refuse what does not belong to the run that is there."""
-        self.plan.out.mkdir(parents=True, exist_ok=True)
-        facts = {
-            "version": __version__,
-            "inputs": {t.name: [t.size, t.mtime_ns] for t in self.sources.values()},
-            "params": self.plan.params.as_dict(),
-            "chunk_size_m": self.plan.grid.size / MM,
-            "buffer_m": self.plan.buffer / MM,
-        }
-        self.facts = facts
-        resumed = self.ledger.begin(facts, overwrite=overwrite, accept_changes=accept_changes)
-        units = [self.plan.survey.unit_xy, self.plan.survey.unit_z]
-        classes = self.plan.params.classes.as_dict() | {"returns": self.plan.params.returns}
-        self.tile_key = digest(
-            [__version__, facts["inputs"], classes, self.plan.grid.size, self.plan.stored_buffer, units]
-        )
+        _check_targets(self.plan)
+        old = {} if overwrite or not self.store.exists() else self.store.attributes().get("facts", {})
+        resumed = self.ledger.begin(self.inputs.facts(), overwrite=overwrite, accept_changes=accept_changes)
+        save_plan(self.store, self.plan)
+        sweep(self.plan.out)
+        take_notes(self.plan.out, self.store)
+        for name in old.get("inputs", {}).keys() - {t.name for t in self.inputs.sources.values()}:
+            (self.plan.out / "laz" / name).unlink(missing_ok=True)
         self.on_event(Event("run", "started", record={"resumed": resumed, "out": str(self.plan.out)}))
 
-    def _tile_job(self, source: str) -> TileJob:
-        p = self.plan
-        return TileJob(
-            source, self.sources[source], p.survey.unit_xy, p.survey.unit_z, p.params, p.grid, p.stored_buffer
-        )
+    def go(self) -> bool:
+        """Go through all stages; tell whether no damage was found."""
+        self.waiting, self.damaged = [], []
+        self.tile()
+        if self.tiles or not self.failures:
+            self.classify()
+            self.merge()
+            self.rasterize()
+        for path in self.damaged:
+            heal(self.store, path)
+        return not self.damaged
 
     def tile(self) -> None:
         """Cut the source files; afterwards a place without fragments is known to be empty."""
-        work = [
-            Work(
-                source,
-                tile.point_count,
-                self._tile_job(source),
-            )
-            for source, tile in self.sources.items()
-        ]
-        work.sort(key=lambda w: (-w.points, w.ident))
-        self.tiles = self._stage("tile", tasks.tile, self.tile_key, work)
-        self._stop_on_failures("tile")
-        self.chunk_points: dict[str, int] = {}
-        for record in self.tiles.values():
-            for chunk, (core, _, _) in record["chunks"].items():
-                if core:
-                    self.chunk_points[chunk] = self.chunk_points.get(chunk, 0) + core
-        bounds = [Rect(*r["bounds"]) for r in self.tiles.values() if r["bounds"] and r["eligible"]]
-        self.extent = bounds[0] if bounds else Rect(0, 0, 0, 0)
-        for b in bounds[1:]:
-            self.extent = self.extent.union(b)
+        self.tiles = self._stage("tile", tasks.tile, self.inputs.tile_works())
+        self.cutting = Cutting(self.inputs, self.store, self.tiles)
+        self.cutting.index.publish(self.store)
 
     def density(self) -> Density:
-        """Count points and occupied cells of the survey; cells that several files share are united."""
-        holders: dict[str, list[str]] = {}
-        for source, record in self.tiles.items():
-            for chunk, (core, _, _) in record["chunks"].items():
-                if core:
-                    holders.setdefault(chunk, []).append(source)
-        cells = 0
-        for chunk, sources in holders.items():
-            if len(sources) == 1:
-                cells += self.tiles[sources[0]]["chunks"][chunk][1]
-            else:
-                bits = [
-                    unpack_cells(self.store.fragment_attributes(chunk, "core", s)["density_cells"]) for s in sources
-                ]
-                united = bits[0].copy()
-                for other in bits[1:]:
-                    united |= other
-                cells += int.from_bytes(united.tobytes(), "big").bit_count()
-        return Density(sum(self.chunk_points.values()), cells)
+        """Return points and occupied cells of the survey."""
+        return self.cutting.density
 
     def classify(self) -> None:
         """Classify the chunks, densest first."""
-        p = self.plan
-        chosen = filters.of(p.params.filter)
-        self.found_density = self.density()
-        self.filter: Parameters = chosen.resolve(p.params.filter, self.found_density)
-        self.cut = Cut(p.grid, p.stored_buffer, self.extent)
-        limit = max(p.buffer, round(p.params.chunks.max_buffer * MM)) if chosen.exact else p.buffer
-        self.classify_key = digest([self.tile_key, self.filter.as_dict()])
-        work = [
-            Work(chunk, n, tasks.ClassifyJob(p.grid.parse(chunk), self.cut, self.filter, p.buffer, limit))
-            for chunk, n in sorted(self.chunk_points.items(), key=lambda item: (-item[1], item[0]))
-        ]
-        self.chunks = self._stage("classify", tasks.classify, self.classify_key, work)
-        self._stop_on_failures("classify")
+        works = self.cutting.classify_works()
+        self.chunks = self._stage(
+            "classify", tasks.classify, works, lambda _, record: self.cutting.still_proven(record)
+        )
 
     def merge(self) -> None:
         """Write each source file again, classified."""
-        p = self.plan
-        work = [
-            Work(
-                source,
-                tile.point_count,
-                MergeJob(
-                    self._tile_job(source),
-                    str(p.out / "laz" / tile.name),
-                ),
-            )
-            for source, tile in self.sources.items()
-        ]
-        work.sort(key=lambda w: (-w.points, w.ident))
-        key = digest([self.classify_key, p.params.classes.as_dict()])
-        self.merged = self._stage("merge", tasks.merge, key, work, self._merged_still_there)
-        self._stop_on_failures("merge")
-
-    def _merged_still_there(self, ident: str, record: dict[str, Any]) -> bool:
-        path = self.plan.out / "laz" / self.sources[ident].name
-        return path.is_file() and path.stat().st_size == record["bytes"]
+        works, waiting = self.cutting.merge_works(self.chunks)
+        self.waiting += waiting
+        self.merged = self._stage(
+            "merge",
+            tasks.merge,
+            works,
+            lambda ident, record: _same_size(Path(self.cutting.target(ident)), record),
+        )
+        for source in self.inputs.sources.keys() - self.merged.keys():
+            self._remove_outdated("merge", source, self.cutting.merge_key(source), Path(self.cutting.target(source)))
 
     def rasterize(self) -> None:
         """Compute the blocks of the terrain model and export it."""
-        p = self.plan
-        key = digest([self.classify_key, p.params.dtm.as_dict(), p.survey.unit_z, p.survey.crs])
-        raster = Raster.over(DtmGrid.from_params(p.params.dtm), self.extent)
+        p, key = self.plan, self.cutting.raster_key
         layout = self.store.get_record("raster", "layout")
         if layout is None or layout["fingerprint"] != key:
-            create(self.store, raster, p.params.dtm, p.survey)
+            self.store.drop_record("raster", "layout")
+            self.store.drop("ledger/dtm")
+            create(self.store, self.cutting.raster, p.params.dtm, p.survey)
             self.store.put_record("raster", "layout", {"fingerprint": key})
-        ground = {p.grid.parse(c).core: r["ground"] for c, r in self.chunks.items() if r["ground"]}
-        work = [
-            Work(block.id, points, RasterJob(block, raster, self.cut, p.params.dtm, p.survey.unit_z))
-            for block, points in jobs(raster, ground, p.params.dtm)
-        ]
-        self.blocks = self._stage("dtm", tasks.rasterize, key, work)
-        self._stop_on_failures("dtm")
-        target = p.out / "dtm.tif"
-        export = [Work("dtm", sum(w.points for w in work), str(target))]
-        self._stage("cog", tasks.export, key, export, lambda _, record: _same_size(target, record))
-        self._stop_on_failures("cog")
+        works, waiting = self.cutting.dtm_works(self.chunks)
+        self.blocks = self._stage("dtm", tasks.rasterize, works)
+        failed = [Waiting("dtm", w.ident, "it failed") for w in works if w.ident not in self.blocks]
+        done = [w for w in works if w.ident in self.blocks]
+        self.waiting += waiting
+        export = self.cutting.cog_work(done, waiting + failed)
+        exported = self._stage("cog", tasks.export, [export], lambda name, record: _same_size(p.out / name, record))
+        for name in {"dtm.tif", "dtm.partial.tif"} - exported.keys():
+            whole = self.cutting.cog_work(works, []).fingerprint
+            self._remove_outdated("cog", name, whole if name == "dtm.tif" else "", p.out / name)
 
     # -- how it is run --------------------------------------------------------------------------------------------
 
@@ -211,85 +185,143 @@ class _Run:
         self,
         name: StageName,
         function: Any,
-        key: str,
-        work: Iterable[Work],
-        still_good: Any = None,
-    ) -> dict[str, dict[str, Any]]:
+        works: Iterable[Work],
+        still_good: Callable[[str, dict[str, Any]], bool] = lambda ident, record: True,
+    ) -> Records:
         """Do what the ledger does not hold yet; return all records of the stage."""
-        work = list(work)
-        wanted = {w.ident for w in work}
-        records = {
-            ident: record
-            for ident, record in self.ledger.done(name, key).items()
-            if ident in wanted and (still_good is None or still_good(ident, record))
-        }
-        todo = [w for w in work if w.ident not in records]
-        total = sum(w.points for w in work)
-        resumed = sum(w.points for w in work if w.ident in records)
+        works = list(works)
+        found = self.ledger.done(name, {w.ident: w.fingerprint for w in works})
+        records = {ident: record for ident, record in found.items() if still_good(ident, record)}
+        todo = [w for w in works if w.ident not in records and (name, w.ident) not in self.failures]
+        total = sum(w.points for w in works)
+        resumed = sum(w.points for w in works if w.ident in records)
         self.on_event(
-            Event(name, "stage", points=resumed, total=total, record={"tasks": len(work), "done": len(records)})
+            Event(name, "stage", points=resumed, total=total, record={"tasks": len(works), "done": len(records)})
         )
-        stage = Stage(name, function, self.store.url, key, digest([self.store.url, key])[:8])
-        for item, outcome in execute(self.client, stage, todo, self.on_event):
-            if isinstance(outcome, Failure):
-                self.failures.append(outcome)
-            else:
+        if todo:
+            (self.plan.out / "run.json").unlink(missing_ok=True)
+        stage = Stage(name, function, self.store.url, digest([self.store.url, os.getpid()])[:8])
+        for item, outcome in execute(self.client, stage, todo, self.on_event, self.check):
+            if not isinstance(outcome, Failure):
                 records[item.ident] = outcome
+            elif outcome.damaged:
+                self.damaged.append(outcome.damaged)
+            else:
+                self.failures[name, item.ident] = outcome
         self.totals[name] = _summary(records)
         return records
 
-    def _stop_on_failures(self, stage: str) -> None:
-        if not self.failures:
-            return
-        write_json(self.plan.out / "failures.json", [asdict(f) for f in self.failures])
-        lines = "\n".join(f"  {f.stage} {self._name(f)}: {f.error}" for f in self.failures[:10])
-        raise PartialRunError(
-            f"{len(self.failures)} pieces of stage {stage} failed, the others are done:\n{lines}\n"
-            f"Details are in {self.plan.out / 'failures.json'}; mend the cause and give the same command again."
-        )
-
-    def _name(self, failure: Failure) -> str:
-        tile = self.sources.get(failure.ident)
-        return f"{failure.ident} ({tile.path})" if tile else failure.ident
+    def _remove_outdated(self, stage: StageName, ident: str, fingerprint: str, path: Path) -> None:
+        """Remove a result of other settings or inputs whose successor could not be made: it would look like one."""
+        if not self.ledger.done(stage, {ident: fingerprint}):
+            path.unlink(missing_ok=True)
 
     def finish(self) -> None:
-        """Write ``run.json``; the last file of a run."""
-        points_in = sum(t.point_count for t in self.sources.values())
+        """Write ``run.json``, the last file of a run, or say what is missing."""
+        if self.failures or self.waiting or self.damaged:
+            self._partial()
+        points_in = sum(t.point_count for t in self.inputs.sources.values())
         points_out = sum(r["points"] for r in self.merged.values())
         if points_in != points_out:
             raise PlanError(f"{points_in} points came in but {points_out} went out; report this with run.json")
-        unproven = sum(r["unproven"] for r in self.chunks.values())
-        report: dict[str, Any] = {
-            "ppdf_dask": __version__,
-            "python": platform.python_version(),
-            "packages": {name: version(name) for name in PACKAGES},
-            "inputs": [t.as_dict() for t in self.sources.values()],
-            "crs": self.plan.survey.crs,
-            "plan": self.plan.facts(),
-            "filter": self.filter.as_dict(),
-            "density": {"points": self.found_density.points, "cells": self.found_density.cells},
-            "counts": {
-                "points": points_out,
-                "eligible": sum(r["eligible"] for r in self.tiles.values()),
-                "ground": sum(r["ground"] for r in self.chunks.values()),
-                "unproven": unproven,
-                "chunks": len(self.chunks),
-                "blocks": len(self.blocks),
-            },
-            "stages": self.totals,
-        }
+        report = self._report()
         write_json(self.plan.out / "run.json", report)
         (self.plan.out / "failures.json").unlink(missing_ok=True)
         self.on_event(Event("run", "finished", record=report["counts"]))
+        unproven = report["counts"]["unproven"]
         if unproven:
             raise PartialRunError(
                 f"{unproven} points could not be proven within --max-buffer "
                 f"{self.plan.params.chunks.max_buffer:g} m; they are classified as far as known, listed per chunk in "
-                "the ledger. Give a wider --max-buffer to settle them."
+                "the ledger. Give a wider --max-buffer with --accept-changes to settle them."
             )
 
+    def _report(self) -> dict[str, Any]:
+        density = self.cutting.density
+        return {
+            "ppdf_dask": __version__,
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            "packages": {name: version(name) for name in PACKAGES},
+            "inputs": [t.as_dict() for t in self.inputs.sources.values()],
+            "crs": self.plan.survey.crs,
+            "plan": self.plan.facts(),
+            "filter": self.cutting.filter.as_dict(),
+            "density": {"points": density.points, "cells": density.cells},
+            "counts": {
+                "points": sum(r["points"] for r in self.merged.values()),
+                "eligible": sum(r["eligible"] for r in self.tiles.values()),
+                "ground": sum(r["ground"] for r in self.chunks.values()),
+                "unproven": sum(r["unproven"] for r in self.chunks.values()),
+                "chunks": len(self.chunks),
+                "blocks": len(self.blocks),
+            },
+            "stages": self.totals,
+            "memory": {
+                "planned_task_mb": round(self.plan.task_mb),
+                "limit_mb": round(self.plan.memory / 1e6),
+                "peak_mb": max(s["peak_mb"] for s in self.totals.values()),
+            },
+        }
 
-def _summary(records: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    def _partial(self) -> None:
+        described = [self._describe(f) for f in self.failures.values()]
+        path = write_failures(self.plan.out, described, self.waiting)
+        lines = [f"  {d['stage']} {d['id']} ({d['what']}): {d['error']}" for d in described]
+        lines += [f"  {path}: damaged again each time it was made" for path in self.damaged]
+        unproven = sum(r["unproven"] for r in self.chunks.values())
+        self.on_event(Event("run", "finished", record={"failed": len(described), "waiting": len(self.waiting)}))
+        raise PartialRunError(
+            f"{len(lines)} pieces of work failed and {len(self.waiting)} wait for them, all others are done:\n"
+            + "\n".join(lines[:10])
+            + (f"\n  and {len(lines) - 10} more" if len(lines) > 10 else "")
+            + (f"\n{unproven} points near what failed are classified but not proven" if unproven else "")
+            + f"\nDetails are in {path}. Mend the cause, then `ppdf-dask retry {self.plan.out}` does only what is "
+            "missing; `ppdf-dask debug` replays one chunk alone."
+        )
+
+    def _describe(self, failure: Failure) -> dict[str, Any]:
+        """Return all that helps to find the cause of a failure."""
+        tile, need = self.inputs.sources.get(failure.ident), None
+        files: list[str] = [] if tile is None else [tile.path]
+        box = None if tile is None else tile.bounds
+        what = "" if tile is None else shown(tile.path)
+        if failure.stage == "classify":
+            box = self.plan.grid.parse(failure.ident).core
+            sources = {s for part in self.cutting.index.chunks[failure.ident].values() for s in part}
+            files = [self.inputs.sources[s].path for s in sorted(sources)]
+            need = self.cutting.need_mb(failure.ident)
+            what = f"needs about {need:.0f} MB, a worker has {self.plan.memory / 1e6:.0f} MB"
+        elif failure.stage == "dtm":
+            box = next(b.rect for b in self.cutting.raster.grid.over(self.cutting.extent) if b.id == failure.ident)
+        return {
+            "stage": failure.stage,
+            "id": failure.ident,
+            "what": what or failure.stage,
+            "bounds_m": None if box is None else [v / MM for v in (box.x0, box.y0, box.x1, box.y1)],
+            "files": files,
+            "error": failure.error,
+            "traceback": failure.detail,
+            "need_mb": need,
+        }
+
+
+def _check_targets(plan: Plan) -> None:
+    """Refuse to write over an input, or through a link to somewhere else."""
+    plan.out.mkdir(parents=True, exist_ok=True)
+    root, folders = os.path.realpath(plan.out), {}
+    for tile in plan.survey.tiles:
+        target = plan.out / "laz" / tile.name
+        if target.parent not in folders:
+            folders[target.parent] = os.path.realpath(target.parent)
+        parent = folders[target.parent]
+        if os.path.commonpath([root, parent]) != root:
+            raise SurveyError(f"{target.parent} leads out of {plan.out}, to {parent}; choose another --out")
+        if os.path.realpath(tile.path) == os.path.join(parent, target.name):
+            raise SurveyError(f"{target} is an input; inputs are never written to: choose another --out")
+
+
+def _summary(records: Records) -> dict[str, Any]:
     values = records.values()
     return {
         "tasks": len(records),
@@ -301,10 +333,3 @@ def _summary(records: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 def _same_size(path: Path, record: dict[str, Any]) -> bool:
     return path.is_file() and path.stat().st_size == record["bytes"]
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON under a temporary name and move it into place."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(value, indent=1, sort_keys=True, default=str) + "\n", encoding="utf-8")
-    os.replace(part, path)

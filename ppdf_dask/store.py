@@ -1,4 +1,4 @@
-"""The Zarr v3 layout of a run and every read and write of it; the only importer of zarr.
+"""The Zarr v3 layout of a run and every read and write of it.
 
 Layout of ``run.zarr`` (each leaf has exactly one writer)::
 
@@ -8,14 +8,16 @@ Layout of ``run.zarr`` (each leaf has exactly one writer)::
     ground/<chunk>                   int32 (3, n): the ground points, for the terrain model
     dtm/{height,distance,y,x}        float32 blocks of the global raster, one shard each
     ledger/<stage>/<id>              what is done: a Zarr group whose attributes are the record
+    ledger/index/<chunk>             which fragments a chunk consists of, and of how many points (`ppdf_dask.index`)
 
-A record of the ledger is one object written by one atomic put, so no rename is needed of the store behind it. Every
-array carries a checksum (crc32c) per object, and its fill value can never be taken for data.
+Every object is written by one atomic put of its final bytes, an array's metadata after its data: no rename is needed of
+the store behind it, an array that is there is whole, and a task that runs twice at once does no harm. Every array
+carries a checksum (crc32c) per object, its own path and the fingerprint it was made with, so that no other array can
+be taken for it; its fill value can never be taken for data.
 """
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -24,15 +26,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import zarr
-from zarr.abc.store import Store
 from zarr.codecs import BloscCodec, Crc32cCodec
-from zarr.core.buffer import default_buffer_prototype
-from zarr.core.sync import sync
-from zarr.storage import LocalStore
+from zarr.storage import MemoryStore
 
-from ppdf_dask.errors import StoreError
+from ppdf_dask.errors import DamagedError, StoreError
+from ppdf_dask.objects import ObjectStore, node_bytes
 
-FORMAT = 1
+FORMAT = 2
 """Version of the layout above; a store of another version is refused."""
 
 # Bit shuffling in zstd packs the integers of a fragment to 4 to 6 bytes a point at 50 million points a second; a delta
@@ -43,14 +43,18 @@ _BYTES = (BloscCodec(typesize=1, cname="zstd", clevel=3, shuffle="bitshuffle"), 
 # One object for a fragment up to this many points; a longer one gets more, in proportion to the data.
 _CHUNK_POINTS = 8_000_000
 
+GROUPS = ("ledger", "chunks", "classification", "ground")
 
-class RunStore:
+
+class RunStore(ObjectStore):
     """Reads and writes one ``run.zarr``; cheap to make, so each task makes its own.
 
     Parameters
     ----------
     url : str
         Path of the ``run.zarr`` folder.
+    made_by : str
+        Fingerprint that arrays written through this object carry.
 
     Examples
     --------
@@ -64,19 +68,19 @@ class RunStore:
     (3, 4)
     """
 
-    def __init__(self, url: str) -> None:
-        self.url = url
-        self._store: Store = LocalStore(url)
+    def __init__(self, url: str, made_by: str = "") -> None:
+        super().__init__(url)
+        self.made_by = made_by
 
     def exists(self) -> bool:
         """Tell whether the root of the store has been written."""
-        return self._get("zarr.json") is not None
+        return self.has("")
 
     def create(self, attributes: dict[str, Any]) -> None:
         """Write the root group; existing content stays."""
-        for group in ("chunks", "classification", "ground", "ledger"):
-            self._put_group(group, {})
-        self._put_group("", {"ppdf_dask_format": FORMAT, **attributes})
+        for group in GROUPS:
+            self.put_node(group, {})
+        self.put_node("", {"ppdf_dask_format": FORMAT, **attributes})
 
     def attributes(self) -> dict[str, Any]:
         """Return the root attributes.
@@ -86,7 +90,7 @@ class RunStore:
         StoreError
             When there is no store or it has another layout version.
         """
-        found = self._get_group("")
+        found = self.get_node("")
         if found is None:
             raise StoreError(f"{self.url} is not a run's store; give the --out folder of an earlier run")
         if found.get("ppdf_dask_format") != FORMAT:
@@ -97,8 +101,10 @@ class RunStore:
         return found
 
     def erase(self) -> None:
-        """Remove everything below the store's root."""
-        sync(self._store.clear())
+        """Remove everything but the lock: the ledger first, so that it never claims what is gone, the root last."""
+        for group in (*GROUPS, "dtm"):
+            self.drop(group)
+        self.delete("zarr.json")
 
     # -- points ---------------------------------------------------------------------------------------------------
 
@@ -113,26 +119,48 @@ class RunStore:
         """Write one fragment, replacing what an interrupted attempt left under its name."""
         self._write(f"chunks/{chunk}/{part}/{source}", points, _POINTS, -(2**31), attributes)
 
-    def read_points(self, chunk: str, part: str, source: str) -> npt.NDArray[np.int32]:
-        """Read one fragment, int32 (rows, n)."""
-        points: npt.NDArray[np.int32] = self._read(f"chunks/{chunk}/{part}/{source}")
+    def read_points(
+        self, chunk: str, part: str, source: str, expected: tuple[int, str] | None = None
+    ) -> npt.NDArray[np.int32]:
+        """Read one fragment, int32 (rows, n).
+
+        Parameters
+        ----------
+        chunk, part, source : str
+            Its name.
+        expected : tuple of int and str, optional
+            Points it must have and the fingerprint it must be made with.
+
+        Raises
+        ------
+        DamagedError
+            When it is missing, torn, or not what is expected.
+        """
+        path = f"chunks/{chunk}/{part}/{source}"
+        points: npt.NDArray[np.int32] = self._read(path, expected[1] if expected else None)
+        if expected and points.shape[1] != expected[0]:
+            raise self.damage(path, f"holds {points.shape[1]} points, the ledger says {expected[0]}")
         return points
 
     def fragment_attributes(self, chunk: str, part: str, source: str) -> dict[str, Any]:
         """Return a fragment's attributes without reading its points."""
-        return self._get_group(f"chunks/{chunk}/{part}/{source}") or {}
+        path = f"chunks/{chunk}/{part}/{source}"
+        found = self.get_node(path)
+        if found is None or found.get("path") != path:
+            raise self.damage(path, "is missing" if found is None else f"is really {found.get('path')}")
+        return found
 
     def sources(self, chunk: str, part: str) -> list[str]:
         """Return the sorted ids of the source files that have a fragment in this part of the chunk."""
-        return self._children(f"chunks/{chunk}/{part}")
+        return self.children(f"chunks/{chunk}/{part}")
 
     def chunks(self) -> list[str]:
         """Return the sorted ids of all chunks with fragments."""
-        return self._children("chunks")
+        return self.children("chunks")
 
     def drop_points(self) -> None:
         """Remove all fragments: they are only needed until the run is complete."""
-        sync(self._store.delete_dir("chunks"))
+        self.drop("chunks")
 
     # -- results --------------------------------------------------------------------------------------------------
 
@@ -141,21 +169,21 @@ class RunStore:
         attributes = {"sources": list(counts), "counts": list(counts.values())}
         self._write(f"classification/{chunk}", ground.astype(np.uint8), _BYTES, 255, attributes)
 
-    def read_classification(self, chunk: str) -> dict[str, npt.NDArray[np.bool_]]:
+    def read_classification(self, chunk: str, made_by: str | None = None) -> dict[str, npt.NDArray[np.bool_]]:
         """Return the mask of each source of a chunk.
 
         Raises
         ------
-        StoreError
+        DamagedError
             When the chunk is not there, torn, or holds a value that is no class.
         """
         path = f"classification/{chunk}"
-        attributes = self._get_group(path)
+        attributes = self.get_node(path)
         if attributes is None:
-            raise StoreError(f"{path} is missing in {self.url}; run again to classify the chunk")
-        values = self._read(path)
+            raise self.damage(path, "is missing")
+        values = self._read(path, made_by)
         if (values > 1).any() or sum(attributes["counts"]) != len(values):
-            raise StoreError(f"{path} in {self.url} is incomplete; `ppdf-dask verify` lists it, `run` redoes it")
+            raise self.damage(path, "is incomplete")
         bounds = np.cumsum([0, *attributes["counts"]])
         return {
             source: values[bounds[k] : bounds[k + 1]].view(np.bool_) for k, source in enumerate(attributes["sources"])
@@ -163,16 +191,14 @@ class RunStore:
 
     def classified(self) -> list[str]:
         """Return the sorted ids of all chunks that have a mask."""
-        return self._children("classification")
+        return self.children("classification")
 
     def write_ground(self, chunk: str, points: npt.NDArray[np.int32]) -> None:
         """Write a chunk's ground points, int32 (3, n), for the terrain model."""
         self._write(f"ground/{chunk}", points, _POINTS, -(2**31), None)
 
     def read_ground(self, chunk: str) -> npt.NDArray[np.int32]:
-        """Read a chunk's ground points; a chunk without any has none."""
-        if self._get(f"ground/{chunk}/zarr.json") is None:
-            return np.empty((3, 0), np.int32)
+        """Read a chunk's ground points."""
         points: npt.NDArray[np.int32] = self._read(f"ground/{chunk}")
         return points
 
@@ -186,7 +212,7 @@ class RunStore:
         crs: dict[str, Any],
         attributes: dict[str, dict[str, Any]],
     ) -> None:
-        """Create the ``dtm`` group: one float32 array per key of `attributes`, blocks of `block` pixels as shards.
+        """Create the ``dtm`` group, in place of an older one: float32 arrays with blocks of `block` pixels as shards.
 
         Parameters
         ----------
@@ -197,36 +223,28 @@ class RunStore:
         crs : dict
             Attributes of the ``spatial_ref`` grid-mapping variable.
         attributes : dict
-            Variable name to its attributes (units, long_name).
+            Name of each array to its attributes (units, long_name).
         """
-        self._put_group("dtm", {"Conventions": "CF-1.10"})
+        self.drop("dtm")
+        self.put_node("dtm", {"Conventions": "CF-1.10"})
         for name, values in (("y", y), ("x", x)):
             meta = {"standard_name": f"projection_{name}_coordinate", "axis": name.upper()}
             self._write(f"dtm/{name}", values, None, float("nan"), meta, names=[name])
         self._write("dtm/spatial_ref", np.zeros((), np.int64), None, 0, crs, names=[])
         for name, meta in attributes.items():
-            zarr.create_array(
-                self._store,
-                name=f"dtm/{name}",
-                shape=(len(y), len(x)),
-                dtype="float32",
-                chunks=(block // 2, block // 2),
-                shards=(block, block),
-                compressors=_POINTS,
-                fill_value=float("nan"),
-                dimension_names=["y", "x"],
-                attributes={"grid_mapping": "spatial_ref", **meta},
-                overwrite=True,
-            )
+            objects, _ = _raster(f"dtm/{name}", (len(y), len(x)), block, {"grid_mapping": "spatial_ref", **meta})
+            self._put_array(f"dtm/{name}", objects)
 
     def write_block(self, name: str, row: int, column: int, values: npt.NDArray[np.float32]) -> None:
-        """Write one whole shard of a raster, first deleting what is there: a torn shard cannot be overwritten."""
-        array = self._array(f"dtm/{name}")
-        block = values.shape[0]
+        """Write one whole shard of a raster as one object; a block without any value has none."""
         key = f"dtm/{name}/c/{row}/{column}"
-        sync(self._store.delete(key))
-        if not np.isnan(values).all():
-            array[row * block : (row + 1) * block, column * block : (column + 1) * block] = values
+        if np.isnan(values).all():
+            self.delete(key)
+            return
+        block = values.shape[0]
+        objects, array = _raster(f"dtm/{name}", values.shape, block, {})
+        array[...] = values
+        self.put(key, objects[f"dtm/{name}/c/0/0"].to_bytes())
 
     def raster(self, name: str) -> Any:
         """Return the Zarr array of a raster for reading."""
@@ -236,63 +254,71 @@ class RunStore:
 
     def put_record(self, stage: str, ident: str, record: dict[str, Any]) -> None:
         """Publish a record by one atomic put."""
-        self._put_group(f"ledger/{stage}/{ident}", record)
+        self.put_node(f"ledger/{stage}/{ident}", record)
 
     def get_record(self, stage: str, ident: str) -> dict[str, Any] | None:
-        """Return a record, or None."""
-        return self._get_group(f"ledger/{stage}/{ident}")
+        """Return a record; None when there is none, or what is there is torn: its work is to be done again."""
+        try:
+            return self.get_node(f"ledger/{stage}/{ident}")
+        except DamagedError:
+            return None
 
     def records(self, stage: str) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield the records of a stage, sorted by id."""
-        for ident in self._children(f"ledger/{stage}"):
+        for ident in self.children(f"ledger/{stage}"):
             record = self.get_record(stage, ident)
             if record is not None:
                 yield ident, record
 
     def drop_record(self, stage: str, ident: str) -> None:
         """Remove a record: its work is to be done again."""
-        sync(self._store.delete(f"ledger/{stage}/{ident}/zarr.json"))
+        self.delete(f"ledger/{stage}/{ident}/zarr.json")
 
-    # -- bytes ----------------------------------------------------------------------------------------------------
+    # -- lock -----------------------------------------------------------------------------------------------------
 
-    def _get(self, key: str) -> bytes | None:
-        value = sync(self._store.get(key, default_buffer_prototype()))
-        return None if value is None else value.to_bytes()
+    def claim(self, lock: dict[str, Any]) -> bool:
+        """Put the lock where there is none, in one atomic step; tell whether it is there now."""
+        self.put_new("lock/zarr.json", node_bytes({"lock": lock}))
+        return self.lock() == lock
 
-    def _put_group(self, path: str, attributes: dict[str, Any]) -> None:
-        node = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-        value = default_buffer_prototype().buffer.from_bytes(json.dumps(node, sort_keys=True).encode())
-        sync(self._store.set(f"{path}/zarr.json".lstrip("/"), value))
-
-    def _get_group(self, path: str) -> dict[str, Any] | None:
-        raw = self._get(f"{path}/zarr.json".lstrip("/"))
-        if raw is None:
-            return None
+    def lock(self) -> dict[str, Any] | None:
+        """Return who holds the lock, or None; a torn lock is one of nobody."""
         try:
-            found = json.loads(raw)["attributes"]
-        except (ValueError, KeyError, TypeError):
-            raise StoreError(f"{path}/zarr.json in {self.url} is torn; delete it and run again") from None
-        return dict(found)
+            node = self.get_node("lock")
+        except DamagedError:
+            return {}
+        return None if node is None else dict(node.get("lock") or {})
 
-    def _children(self, path: str) -> list[str]:
-        return sorted(name for name in sync(_collect(self._store, path)) if name != "zarr.json")
+    def renew(self, lock: dict[str, Any]) -> None:
+        """Replace the lock one holds."""
+        self.put_node("lock", {"lock": lock})
+
+    def unlock(self) -> None:
+        """Remove the lock."""
+        self.drop("lock")
+
+    # -- arrays ---------------------------------------------------------------------------------------------------
 
     def _array(self, path: str) -> Any:
         try:
-            return zarr.open_array(self._store, path=path, mode="r+")
+            return zarr.open_array(self._store, path=path, mode="r", zarr_format=3)
         except FileNotFoundError:
-            raise StoreError(
-                f"{path} is missing in {self.url}; `ppdf-dask verify` lists what has to be redone"
-            ) from None
+            raise self.damage(path, "is missing") from None
+        except (ValueError, TypeError, KeyError) as error:
+            raise self.damage(path, f"has torn metadata ({error})") from error
 
-    def _read(self, path: str) -> Any:
+    def _read(self, path: str, made_by: str | None = None) -> Any:
         array = self._array(path)
+        if array.attrs.get("path") != path:
+            raise self.damage(path, f"is really {array.attrs.get('path')}")
+        if made_by is not None and array.attrs.get("made_by") != made_by:
+            raise self.damage(path, "is of another run or of other settings")
         if array.nchunks_initialized != array.nchunks:
-            raise StoreError(f"{path} in {self.url} has lost data; `ppdf-dask verify` lists what has to be redone")
+            raise self.damage(path, "has lost data")
         try:
             return array[...]
         except (ValueError, RuntimeError) as error:
-            raise StoreError(f"{path} in {self.url} is damaged ({error}); delete it and run again") from error
+            raise self.damage(path, f"is damaged ({error})") from error
 
     def _write(
         self,
@@ -304,11 +330,12 @@ class RunStore:
         names: list[str] | None = None,
     ) -> None:
         chunks = (*values.shape[:-1], min(max(values.shape[-1], 1), _CHUNK_POINTS)) if values.shape else ()
+        objects: dict[str, Any] = {}
         with warnings.catch_warnings():
             # An empty array is legitimate here (a chunk without ground); zarr warns of its chunk being larger.
             warnings.simplefilter("ignore", UserWarning)
             array = zarr.create_array(
-                self._store,
+                MemoryStore(objects),
                 name=path,
                 shape=values.shape,
                 dtype=values.dtype,
@@ -316,17 +343,40 @@ class RunStore:
                 compressors=compressors if compressors is not None else "auto",
                 fill_value=fill,
                 dimension_names=names,
-                attributes=attributes or {},
-                overwrite=True,
+                attributes=attributes if path.startswith("dtm/") else self._identity(path) | (attributes or {}),
                 # A chunk full of the fill value must be stored all the same: a missing object always means a loss.
                 config={"write_empty_chunks": True},
             )
         if values.size or not values.shape:
             array[...] = values
+        self._put_array(path, objects)
+
+    def _identity(self, path: str) -> dict[str, Any]:
+        return {"path": path, "made_by": self.made_by}
+
+    def _put_array(self, path: str, objects: dict[str, Any]) -> None:
+        """Put an array's objects, its metadata last: who finds it finds all of it."""
+        keys = sorted(key for key in objects if key.startswith(path + "/"))
+        for key in sorted(keys, key=lambda key: key.endswith("zarr.json")):
+            self.put(key, objects[key].to_bytes())
 
 
-async def _collect(store: Store, path: str) -> list[str]:
-    return [name async for name in store.list_dir(path)]
+def _raster(path: str, shape: tuple[int, ...], block: int, attributes: dict[str, Any]) -> tuple[dict[str, Any], Any]:
+    """Make a raster in memory; return its objects, which grow as it is written, and the array."""
+    objects: dict[str, Any] = {}
+    array = zarr.create_array(
+        MemoryStore(objects),
+        name=path,
+        shape=shape,
+        dtype="float32",
+        chunks=(block // 2, block // 2),
+        shards=(block, block),
+        compressors=_POINTS,
+        fill_value=float("nan"),
+        dimension_names=["y", "x"],
+        attributes=attributes,
+    )
+    return objects, array
 
 
 def store_of(run: str | Path) -> RunStore:

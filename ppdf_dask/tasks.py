@@ -6,26 +6,30 @@ never leave the worker.
 
 from __future__ import annotations
 
+import errno
+import functools
 import resource
+import shutil
 import sys
+import tempfile
 import time
 import zlib
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ppdf_dask import filters, raster
-from ppdf_dask.grid import Chunk
+from ppdf_dask import raster
+from ppdf_dask.errors import DiskFullError
 from ppdf_dask.ledger import Ledger
 from ppdf_dask.merge import MergeJob, write_tile
 from ppdf_dask.mosaic import open_dtm, write_cog
-from ppdf_dask.neighbourhood import Cut, load
-from ppdf_dask.params import Parameters
 from ppdf_dask.raster import RasterJob
+from ppdf_dask.solve import ClassifyJob, solve
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiler import TileJob, cut
+
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
+"""What the operating system says when nothing more can be written."""
 
 
 def peak_mb() -> float:
@@ -48,71 +52,74 @@ class _Clock:
         }
 
 
+Task = Callable[[str, Any, str], dict[str, Any]]
+
+
+def _says_when_full(function: Task) -> Task:
+    """Turn any error that comes of a full or closed disk into the one that ends the run early."""
+
+    @functools.wraps(function)
+    def run(url: str, job: Any, fingerprint: str) -> dict[str, Any]:
+        try:
+            return function(url, job, fingerprint)
+        except Exception as error:
+            reason = _no_room(error, Path(url).parent)
+            if reason is None:
+                raise
+            raise DiskFullError(
+                f"cannot write below {Path(url).parent} or the temporary folder {tempfile.gettempdir()}: {reason}; "
+                "free some space (`ppdf-dask plan` says how much a run needs) and give the same command again"
+            ) from error
+
+    return run
+
+
+def _no_room(error: BaseException | None, folder: Path) -> str | None:
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in NO_ROOM:
+            return f"{error.strerror}{f' ({error.filename})' if error.filename else ''}"
+        # GDAL and the LAZ library report a failed write in their own ways.
+        if isinstance(error, RuntimeError | OSError) and shutil.disk_usage(folder).free < 1 << 16:
+            return f"no space left ({error})"
+        error = error.__cause__ or error.__context__
+    return None
+
+
+@_says_when_full
 def tile(url: str, job: TileJob, fingerprint: str) -> dict[str, Any]:
     """Cut one source file into fragments."""
-    clock, store = _Clock(), RunStore(url)
+    clock, store = _Clock(), RunStore(url, fingerprint)
     record = {"status": "done", **cut(store, job), **clock.stamp()}
     Ledger(store).publish("tile", job.source, fingerprint, record)
-    return record
+    return record | {"fingerprint": fingerprint}
 
 
-@dataclass(frozen=True)
-class ClassifyJob:
-    """What a worker needs to classify one chunk.
-
-    Attributes
-    ----------
-    chunk : Chunk
-        The chunk.
-    cut : Cut
-        How the survey lies in the store.
-    filter : Parameters
-        The filter's parameters, nothing left to derive.
-    buffer, max_buffer : int
-        First guess and limit of the buffer, mm.
-    """
-
-    chunk: Chunk
-    cut: Cut
-    filter: Parameters
-    buffer: int
-    max_buffer: int
-
-
+@_says_when_full
 def classify(url: str, job: ClassifyJob, fingerprint: str) -> dict[str, Any]:
-    """Classify the core of one chunk, with as wide a buffer as its proof needs."""
-    clock, store = _Clock(), RunStore(url)
-    chosen = filters.of(job.filter)
-    width, tries, loaded = job.buffer, 0, 0
-    while True:
-        cloud, counts = load(store, job.cut, job.chunk, width)
-        verdict = chosen.classify(cloud, job.filter)
-        tries, loaded = tries + 1, cloud.n
-        unproven = int(verdict.unproven.sum())
-        if unproven == 0 or cloud.known is None or width >= job.max_buffer:
-            break
-        width = min(2 * max(width, job.cut.buffer, 10_000), job.max_buffer)
-    ground = verdict.ground
-    if cloud.fixed is not None:
-        ground = ground | cloud.fixed[: cloud.n_core]
-    store.write_classification(job.chunk.id, ground, counts)
-    points = np.stack([v[: cloud.n_core][ground] for v in (cloud.x, cloud.y, cloud.z)])
-    store.write_ground(job.chunk.id, points)
+    """Classify the core of one chunk and write mask and ground points."""
+    clock, store = _Clock(), RunStore(url, fingerprint)
+    found = solve(store, job)
+    n = len(found.ground)
+    store.write_classification(job.chunk.id, found.ground, found.counts)
+    store.write_ground(job.chunk.id, found.core[:3, found.ground])
     record = {
-        "status": "done" if cloud.n_core else "empty",
-        "points": cloud.n_core,
-        "loaded": loaded,
-        "ground": int(ground.sum()),
-        "unproven": unproven,
-        "buffer_m": width / 1000,
-        "tries": tries,
-        "crc32": zlib.crc32(ground.tobytes()),
+        "status": "done" if n else "empty",
+        "points": n,
+        "loaded": found.loaded,
+        "loaded_most": found.loaded_most,
+        "ground": int(found.ground.sum()),
+        "unproven": int(found.unproven.sum()),
+        "buffer_m": found.width / 1000,
+        "tries": found.tries,
+        "full": found.full,
+        "crc32": zlib.crc32(found.ground.tobytes()),
         **clock.stamp(),
     }
     Ledger(store).publish("classify", job.chunk.id, fingerprint, record)
-    return record
+    return record | {"fingerprint": fingerprint}
 
 
+@_says_when_full
 def merge(url: str, job: MergeJob, fingerprint: str) -> dict[str, Any]:
     """Write one source file again, classified."""
     clock, store = _Clock(), RunStore(url)
@@ -121,6 +128,7 @@ def merge(url: str, job: MergeJob, fingerprint: str) -> dict[str, Any]:
     return record
 
 
+@_says_when_full
 def rasterize(url: str, job: RasterJob, fingerprint: str) -> dict[str, Any]:
     """Compute one block of the terrain model."""
     clock, store = _Clock(), RunStore(url)
@@ -129,11 +137,21 @@ def rasterize(url: str, job: RasterJob, fingerprint: str) -> dict[str, Any]:
     return record
 
 
+@_says_when_full
 def export(url: str, target: str, fingerprint: str) -> dict[str, Any]:
     """Export the terrain model as a Cloud-Optimized GeoTIFF."""
     clock, store = _Clock(), RunStore(url)
     path = Path(target)
     write_cog(open_dtm(url, dask=False), path)
-    record = {"status": "done", "bytes": path.stat().st_size, **clock.stamp()}
-    Ledger(store).publish("cog", "dtm", fingerprint, record)
+    record = {"status": "done", "bytes": path.stat().st_size, "crc32": crc32_of(path), **clock.stamp()}
+    Ledger(store).publish("cog", path.name, fingerprint, record)
     return record
+
+
+def crc32_of(path: Path) -> int:
+    """Return the checksum of a file's bytes."""
+    found = 0
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            found = zlib.crc32(block, found)
+    return found

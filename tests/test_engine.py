@@ -22,6 +22,7 @@ from ppdf_dask.params import ChunkParams, ClassRules, DtmParams, RunParams
 from ppdf_dask.plan import plan
 from ppdf_dask.result import Result
 from ppdf_dask.single import classify_tile
+from ppdf_dask.solve import ClassifyJob
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import scan
 from ppdf_dask.synthetic import SyntheticParams, points, write_survey
@@ -211,9 +212,9 @@ def _masks(url: Path, folder: Path, size: float, buffer: float, order: int) -> d
     ids = sorted({c for r in records for c, (core, _, _) in r["chunks"].items() if core})
     np.random.default_rng(order).shuffle(ids)
     # A cell size by hand: the density is the survey's, and has a test of its own.
-    robust = params.filter.replace(cell_size=1.25)
+    robust = params.filter.replace(cell_size=1.25, refinement=2)
     for ident in ids:
-        job = tasks.ClassifyJob(grid.parse(ident), Cut(grid, stored, extent), robust, round(buffer * 1000), 10**7)
+        job = ClassifyJob(grid.parse(ident), Cut(grid, stored, extent), robust, round(buffer * 1000), 10**7)
         record = tasks.classify(str(url), job, "f")
         assert record["unproven"] == 0
     found = {}
@@ -244,7 +245,7 @@ def test_the_result_does_not_depend_on_how_the_survey_was_cut(tmp_path_factory, 
     from ppdf_dask import RobustParams
 
     seen = las.seen
-    whole = classify_ground(las.xyz[seen], RobustParams(cell_size=1.25))
+    whole = classify_ground(las.xyz[seen], RobustParams(cell_size=1.25, refinement=2))
     got = np.concatenate([found[path.name] for path in sorted((folder / "tiles").glob("*.laz"))])
     np.testing.assert_array_equal(got[seen], whole)
     assert not got[~seen].any()

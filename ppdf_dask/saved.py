@@ -1,0 +1,76 @@
+"""A plan kept in the run's store, so that `retry`, `verify`, `status` and `debug` need nothing but the run's folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ppdf_dask import filters
+from ppdf_dask.errors import StoreError
+from ppdf_dask.grid import ChunkGrid
+from ppdf_dask.params import ChunkParams, ClassRules, DtmParams, RunParams
+from ppdf_dask.plan import Plan
+from ppdf_dask.store import RunStore
+from ppdf_dask.survey import Survey
+
+
+def save_plan(store: RunStore, plan: Plan) -> None:
+    """Put a plan into the ledger."""
+    store.put_record("plan", "plan", plan_as_dict(plan))
+
+
+def load_plan(out: str | Path) -> Plan:
+    """Return the plan of a run's folder.
+
+    Raises
+    ------
+    StoreError
+        When there is no run, or its plan is lost; the message says what helps.
+    """
+    store = RunStore(str(Path(out) / "run.zarr"))
+    store.attributes()
+    values = store.get_record("plan", "plan")
+    if values is None:
+        raise StoreError(
+            f"the plan of {out} is missing; give the `ppdf-dask run TILES --out {out}` command again, which restores it"
+        )
+    return plan_from_dict(values, Path(out))
+
+
+def plan_as_dict(plan: Plan) -> dict[str, Any]:
+    """Return a plan as plain JSON; the tiles' CRS records, which are long and mostly equal, stand in a list."""
+    survey = plan.survey.as_dict()
+    known: dict[str | None, int] = {}
+    for tile in survey["tiles"]:
+        tile["crs"] = known.setdefault(tile["crs"], len(known))
+    return {
+        "survey": survey,
+        "crs": list(known),
+        "filter": filters.of(plan.params.filter).name,
+        "params": plan.params.as_dict(),
+        "chunk_size": plan.grid.size,
+        "buffer": plan.buffer,
+        "memory": plan.memory,
+    }
+
+
+def plan_from_dict(values: dict[str, Any], out: Path) -> Plan:
+    """Return the plan that `plan_as_dict` made JSON of."""
+    survey = dict(values["survey"])
+    survey["tiles"] = [tile | {"crs": values["crs"][tile["crs"]]} for tile in survey["tiles"]]
+    params = values["params"]
+    profiles = filters.get(values["filter"]).profiles.values()
+    kind = next(type(p) for p in profiles if type(p).__name__ == params["filter"]["kind"])
+    return Plan(
+        Survey.from_dict(survey),
+        RunParams(
+            filter=kind.from_dict(params["filter"]),
+            classes=ClassRules.from_dict(params["classes"]),
+            chunks=ChunkParams.from_dict(params["chunks"]),
+            dtm=DtmParams.from_dict(params["dtm"]),
+        ),
+        out,
+        ChunkGrid(values["chunk_size"]),
+        values["buffer"],
+        values["memory"],
+    )

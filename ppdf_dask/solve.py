@@ -1,0 +1,195 @@
+"""One chunk from points to labels, with as wide a buffer as each place needs and no more memory than is allowed.
+
+The whole core is classified once with the first guess of the buffer. What that could not prove is classified again with
+a wider buffer, alone: a proof that fails does so in a few places, and their surroundings are small. Where a cloud would
+exceed the memory, its core is cut into quarters. Neither changes a proven answer, for it is that of the whole survey.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ppdf_dask import filters
+from ppdf_dask.grid import Chunk, Rect
+from ppdf_dask.neighbourhood import Cut, Surroundings, unsure
+from ppdf_dask.params import Parameters
+from ppdf_dask.store import RunStore
+
+Int64 = npt.NDArray[np.int64]
+
+NARROW = 10_000
+"""A buffer below this, mm, is widened as if it were this wide."""
+
+
+@dataclass(frozen=True)
+class ClassifyJob:
+    """What a worker needs to classify one chunk.
+
+    Attributes
+    ----------
+    chunk : Chunk
+        The chunk.
+    cut : Cut
+        How the survey lies in the store.
+    filter : Parameters
+        The filter's parameters, nothing left to derive.
+    buffer, max_buffer : int
+        First guess and limit of the buffer, mm.
+    most_points : float
+        Points a cloud may have; default: any number.
+    """
+
+    chunk: Chunk
+    cut: Cut
+    filter: Parameters
+    buffer: int
+    max_buffer: int
+    most_points: float = float("inf")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What classifying a chunk gave.
+
+    Attributes
+    ----------
+    core : ndarray of int32, shape (3 or 4, n)
+        The chunk's points, from its lower-left corner.
+    counts : dict
+        Core points of each source.
+    ground, unproven : ndarray of bool, shape (n,)
+        The mask, and what could not be proven.
+    tries : int
+        Clouds classified.
+    loaded, loaded_most : int
+        Points of all these clouds, and of the largest.
+    width : int
+        The widest buffer tried, mm.
+    full : bool
+        Whether memory, not `max_buffer`, kept it from trying a wider one.
+    """
+
+    core: npt.NDArray[np.int32]
+    counts: dict[str, int]
+    ground: npt.NDArray[np.bool_]
+    unproven: npt.NDArray[np.bool_]
+    tries: int
+    loaded: int
+    loaded_most: int
+    width: int
+    full: bool
+
+
+def solve(store: RunStore, job: ClassifyJob) -> Answer:
+    """Classify the core of one chunk; writes nothing.
+
+    Parameters
+    ----------
+    store : RunStore
+        With all fragments and their index.
+    job : ClassifyJob
+        The chunk and how to go about it.
+
+    Returns
+    -------
+    Answer
+        Every proven answer is that of the whole survey as one chunk.
+
+    Raises
+    ------
+    DamagedError
+        When a fragment is not what the index says.
+    """
+    chosen, near = filters.of(job.filter), Surroundings(store, job.cut, job.chunk)
+    ground, unproven = np.zeros(near.n, np.bool_), np.ones(near.n, np.bool_)
+    reach = 0 if chosen.exact else round(chosen.required_buffer(job.filter) * 1000)
+    lost = unsure(job.cut, job.chunk, near, reach)
+    todo, loads, widest, full = [(job.chunk.core, job.buffer)], [0], job.buffer, False
+    while todo:
+        part, width = todo.pop()
+        if near.expect(part, width) > job.most_points:
+            parts = quarters(part, width)
+            if parts or width > job.buffer:
+                todo += [(p, width) for p in parts]
+                full |= not parts
+                continue
+        cloud, index = near.cloud(part, width)
+        widest = max(widest, width)
+        loads.append(cloud.n)
+        verdict = chosen.classify(cloud, job.filter)
+        # What an earlier cloud proved stays: this one may see less on the far side.
+        index, seen = index[unproven[index]], unproven[index]
+        ground[index] = verdict.ground[seen]
+        unproven[index] = verdict.unproven[seen]
+        left = index[unproven[index] & ~lost[index]]
+        if len(left) == 0 or cloud.known is None or width >= job.max_buffer:
+            continue
+        if width > job.buffer and job.cut.near(part.grow(width)):
+            continue  # What lies there stays unknown, however wide the buffer.
+        wider = min(2 * max(width, job.cut.buffer, NARROW), job.max_buffer)
+        x, y = near.xy()
+        todo += [(place, wider) for place in cover(x[left], y[left], wider)]
+    if len(near.core) > 3:
+        ground |= near.core[3].astype(np.bool_)
+    return Answer(near.core, near.counts, ground, unproven | lost, len(loads) - 1, sum(loads), max(loads), widest, full)
+
+
+def quarters(part: Rect, width: int) -> list[Rect]:
+    """Cut a part of a core in four; none when its buffer makes up so much of the cloud that this would not help.
+
+    Examples
+    --------
+    >>> [p.metres() for p in quarters(Rect(0, 0, 4000, 4000), 1000)]
+    [(0.0, 0.0, 2.0, 2.0), (0.0, 2.0, 2.0, 4.0), (2.0, 0.0, 4.0, 2.0), (2.0, 2.0, 4.0, 4.0)]
+    >>> quarters(Rect(0, 0, 5, 4), 20)
+    []
+    """
+    if 2 * max(part.width, part.height) < width or min(part.width, part.height) < 2:
+        return []
+    x, y = part.x0 + part.width // 2, part.y0 + part.height // 2
+    return [
+        Rect(part.x0, part.y0, x, y),
+        Rect(part.x0, y, x, part.y1),
+        Rect(x, part.y0, part.x1, y),
+        Rect(x, y, part.x1, part.y1),
+    ]
+
+
+def cover(x: Int64, y: Int64, width: int) -> list[Rect]:
+    """Cover points by rectangles that, each with `width` around it, have a small area in sum.
+
+    Parameters
+    ----------
+    x, y : ndarray of int64, shape (n,)
+        At least one point, mm.
+    width : int
+        The buffer each rectangle gets, mm; more than 0.
+
+    Returns
+    -------
+    list of Rect
+        Each point lies in exactly one.
+
+    Examples
+    --------
+    >>> cover(np.array([0, 5, 900]), np.array([0, 5, 0]), 10)
+    [Rect(x0=0, y0=0, x1=6, y1=6), Rect(x0=900, y0=0, x1=901, y1=1)]
+    >>> cover(np.array([0, 5, 900]), np.array([0, 5, 0]), 1000)
+    [Rect(x0=0, y0=0, x1=901, y1=6)]
+    """
+    box = Rect(int(x.min()), int(y.min()), int(x.max()) + 1, int(y.max()) + 1)
+    whole = _area(box, width)
+    if whole <= 2 * (2 * width) ** 2:
+        return [box]
+    wide = box.width >= box.height
+    along, middle = (x, (box.x0 + box.x1) // 2) if wide else (y, (box.y0 + box.y1) // 2)
+    first = along < middle
+    parts = cover(x[first], y[first], width) + cover(x[~first], y[~first], width)
+    return parts if sum(_area(p, width) for p in parts) < whole else [box]
+
+
+def _area(rect: Rect, width: int) -> int:
+    return (rect.width + 2 * width) * (rect.height + 2 * width)

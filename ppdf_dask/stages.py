@@ -1,0 +1,267 @@
+"""What a run consists of: for each stage the pieces of work, their fingerprints and what they wait for.
+
+Pure bookkeeping over the plan and the ledger's records: nothing here runs anything, so that the runner, `verify`,
+`status` and `debug` all speak of the same work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from ppdf_dask import __version__, filters
+from ppdf_dask.dtm import DtmGrid, Raster
+from ppdf_dask.execute import Work
+from ppdf_dask.filters.cloud import Density
+from ppdf_dask.grid import MM, Rect
+from ppdf_dask.index import Index
+from ppdf_dask.ledger import digest
+from ppdf_dask.merge import MergeJob
+from ppdf_dask.neighbourhood import Cut
+from ppdf_dask.params import Parameters
+from ppdf_dask.plan import WORKER_MB, Plan
+from ppdf_dask.raster import RasterJob, jobs
+from ppdf_dask.solve import ClassifyJob
+from ppdf_dask.store import RunStore
+from ppdf_dask.survey import Tile
+from ppdf_dask.tiler import TileJob, unpack_cells
+
+Records = dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A piece of work that cannot be done because another one failed."""
+
+    stage: str
+    ident: str
+    because: str
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The run before any point is read.
+
+    Attributes
+    ----------
+    plan : Plan
+        The plan.
+    """
+
+    plan: Plan
+
+    @cached_property
+    def sources(self) -> dict[str, Tile]:
+        """Source id to tile."""
+        return {f"s_{k:06d}": tile for k, tile in enumerate(self.plan.survey.tiles)}
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a run is bound to: when any of it changes, the run is another one."""
+        p = self.plan
+        return {
+            "version": __version__,
+            "inputs": {t.name: [t.path, t.size, t.mtime_ns] for t in self.sources.values()},
+            "crs": p.survey.crs,
+            "units": [p.survey.unit_xy, p.survey.unit_z],
+            "params": p.params.as_dict(),
+            "chunk_size_m": p.grid.size / MM,
+            "buffer_m": p.buffer / MM,
+        }
+
+    @cached_property
+    def tile_keys(self) -> dict[str, str]:
+        """Fingerprint of each tile's fragments: the tile itself and how it is cut, not the other tiles."""
+        p = self.plan
+        how = digest(
+            [
+                __version__,
+                p.params.classes.as_dict() | {"returns": p.params.returns},
+                p.grid.size,
+                p.stored_buffer,
+                [p.survey.unit_xy, p.survey.unit_z],
+            ]
+        )
+        return {s: digest([how, t.path, t.name, t.size, t.mtime_ns]) for s, t in self.sources.items()}
+
+    def tile_job(self, source: str) -> TileJob:
+        """Return what a worker needs to cut a tile."""
+        p = self.plan
+        return TileJob(
+            source, self.sources[source], p.survey.unit_xy, p.survey.unit_z, p.params, p.grid, p.stored_buffer
+        )
+
+    def tile_works(self) -> list[Work]:
+        """Return the work of the tile stage, largest first."""
+        works = [Work(s, t.point_count, self.tile_job(s), self.tile_keys[s]) for s, t in self.sources.items()]
+        return sorted(works, key=lambda w: (-w.points, w.ident))
+
+
+@dataclass(frozen=True)
+class Cutting:
+    """The run once its tiles are cut.
+
+    Attributes
+    ----------
+    inputs : Inputs
+        The run before.
+    store : RunStore
+        Where the fragments are.
+    tiles : dict
+        Records of the tiles that were cut; the places of all others are unknown.
+    """
+
+    inputs: Inputs
+    store: RunStore
+    tiles: Records
+
+    @cached_property
+    def index(self) -> Index:
+        """Which chunk consists of what."""
+        return Index.of(self.tiles)
+
+    @cached_property
+    def unknown(self) -> tuple[Rect, ...]:
+        """Places of the tiles that could not be cut, as their headers give them."""
+        lost = (t for s, t in self.inputs.sources.items() if s not in self.tiles and t.point_count)
+        return tuple(sorted(t.bounds for t in lost))
+
+    @cached_property
+    def extent(self) -> Rect:
+        """Box around all eligible points and all that is unknown."""
+        boxes = [Rect(*r["bounds"]) for r in self.tiles.values() if r["bounds"] and r["eligible"]]
+        boxes += self.unknown
+        found = boxes[0] if boxes else Rect(0, 0, 0, 0)
+        for box in boxes[1:]:
+            found = found.union(box)
+        return found
+
+    @cached_property
+    def density(self) -> Density:
+        """Points and occupied cells of the survey; cells that several tiles share are united."""
+        cells = 0
+        for chunk, parts in self.index.chunks.items():
+            sources = list(parts["core"])
+            if len(sources) == 1:
+                cells += self.tiles[sources[0]]["chunks"][chunk][1]
+            elif sources:
+                bits = [
+                    unpack_cells(self.store.fragment_attributes(chunk, "core", s)["density_cells"]) for s in sources
+                ]
+                united = bits[0].copy()
+                for other in bits[1:]:
+                    united |= other
+                cells += int.from_bytes(united.tobytes(), "big").bit_count()
+        return Density(sum(self.index.points.values()), cells)
+
+    @cached_property
+    def filter(self) -> Parameters:
+        """The filter's parameters with all that is derived from the density made explicit."""
+        params = self.inputs.plan.params.filter
+        return filters.of(params).resolve(params, self.density)
+
+    @cached_property
+    def cut(self) -> Cut:
+        """How the survey lies in the store."""
+        p = self.inputs.plan
+        return Cut(p.grid, p.stored_buffer, self.extent, self.unknown)
+
+    @property
+    def widest(self) -> int:
+        """The widest buffer a chunk may try, mm."""
+        p = self.inputs.plan
+        return max(p.buffer, round(p.params.chunks.max_buffer * MM)) if filters.of(self.filter).exact else p.buffer
+
+    # -- classify -------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def classify_key(self) -> str:
+        """Fingerprint of every classification: all tiles, the filter, and what is unknown."""
+        p = self.inputs.plan
+        exact = filters.of(self.filter).exact
+        keys = {s: self.inputs.tile_keys[s] for s in self.tiles}
+        unknown = [[r.x0, r.y0, r.x1, r.y1] for r in self.unknown]
+        return digest([keys, unknown, self.filter.as_dict(), None if exact else p.buffer])
+
+    def classify_job(self, chunk: str) -> ClassifyJob:
+        """Return what a worker needs to classify a chunk."""
+        p = self.inputs.plan
+        return ClassifyJob(p.grid.parse(chunk), self.cut, self.filter, p.buffer, self.widest, p.most_points)
+
+    def classify_works(self) -> list[Work]:
+        """Return the work of the classify stage, densest chunk first."""
+        chunks = sorted(self.index.points.items(), key=lambda item: (-item[1], item[0]))
+        return [Work(chunk, n, self.classify_job(chunk), self.classify_key) for chunk, n in chunks]
+
+    def still_proven(self, record: dict[str, Any]) -> bool:
+        """Tell whether a chunk's record is the best that can be had: proven, or as wide as is allowed."""
+        widest = record["full"] or record["buffer_m"] * MM >= self.widest
+        return record["unproven"] == 0 or widest or bool(self.unknown)
+
+    def need_mb(self, chunk: str) -> float:
+        """Return the memory a worker needs for a chunk with its first buffer, MB."""
+        per_point = 24.0 + filters.of(self.filter).bytes_per_point
+        return round(WORKER_MB + self.index.loaded(chunk) * per_point / 1e6)
+
+    # -- merge ----------------------------------------------------------------------------------------------------
+
+    def merge_key(self, source: str) -> str:
+        """Fingerprint of a classified tile."""
+        return digest([self.classify_key, self.inputs.tile_keys[source]])
+
+    def target(self, source: str) -> str:
+        """Return the path of a classified tile."""
+        return str(self.inputs.plan.out / "laz" / self.inputs.sources[source].name)
+
+    def merge_works(self, chunks: Records) -> tuple[list[Work], list[Waiting]]:
+        """Return the tiles whose chunks are all classified, largest first, and those that wait."""
+        works: list[Work] = []
+        waiting: list[Waiting] = []
+        for source, tile in self.inputs.sources.items():
+            if source not in self.tiles:
+                continue
+            missing = [c for c, (core, _, _) in self.tiles[source]["chunks"].items() if core and c not in chunks]
+            if missing:
+                waiting.append(Waiting("merge", source, f"chunk {missing[0]} is not classified"))
+                continue
+            job = MergeJob(self.inputs.tile_job(source), self.target(source), self.classify_key)
+            works.append(Work(source, tile.point_count, job, self.merge_key(source)))
+        return sorted(works, key=lambda w: (-w.points, w.ident)), waiting
+
+    # -- terrain model --------------------------------------------------------------------------------------------
+
+    @cached_property
+    def raster(self) -> Raster:
+        """The raster of the terrain model."""
+        return Raster.over(DtmGrid.from_params(self.inputs.plan.params.dtm), self.extent)
+
+    @cached_property
+    def raster_key(self) -> str:
+        """Fingerprint of the raster's arrays and blocks."""
+        p = self.inputs.plan
+        return digest([self.classify_key, p.params.dtm.as_dict(), p.survey.unit_z, p.survey.crs])
+
+    def dtm_works(self, chunks: Records) -> tuple[list[Work], list[Waiting]]:
+        """Return the blocks all of whose surroundings are classified, fullest first, and those that wait."""
+        p = self.inputs.plan
+        lost = {p.grid.parse(c).core: n for c, n in self.index.points.items() if c not in chunks}
+        lost |= dict.fromkeys(self.unknown, 1)
+        ground = {p.grid.parse(c).core: r["ground"] for c, r in chunks.items() if r["ground"]}
+        # A block's proof reads ground up to two limits around it.
+        reach = 2 * round(max(p.params.dtm.max_edge, p.params.dtm.fill_edge or 0.0) * MM)
+        works: list[Work] = []
+        waiting: list[Waiting] = []
+        for block, points in jobs(self.raster, ground | lost, p.params.dtm):
+            around = block.rect.grow(reach)
+            if any(around.intersects(place) for place in lost):
+                waiting.append(Waiting("dtm", block.id, "ground around it is not known"))
+            else:
+                job = RasterJob(block, self.raster, self.cut, p.params.dtm, p.survey.unit_z)
+                works.append(Work(block.id, points, job, self.raster_key))
+        return works, waiting
+
+    def cog_work(self, works: list[Work], waiting: list[Waiting]) -> Work:
+        """Return the export: ``dtm.tif``, or ``dtm.partial.tif`` while blocks are missing."""
+        name = "dtm.partial.tif" if waiting else "dtm.tif"
+        key = digest([self.raster_key, sorted(w.ident for w in works)])
+        return Work(name, sum(w.points for w in works), str(self.inputs.plan.out / name), key)
