@@ -18,8 +18,8 @@ class Event:
     stage : str
         ``tile``, ``classify``, ``merge``, ``dtm`` or ``run``.
     state : str
-        ``stage`` when a stage begins (`total` and `record` hold what is to do), ``done`` or ``failed`` for one piece of
-        work, ``finished`` at the end.
+        ``stage`` when a stage begins (`total` and `record` hold what is to do, ``record["resumed"]`` the ids done by
+        an earlier run), ``done`` or ``failed`` for one piece of work, ``finished`` at the end.
     ident : str
         Chunk id, source id or block id; empty for whole stages.
     points : int

@@ -283,7 +283,7 @@ def plan(
         grid = ChunkGrid.from_metres(params.chunks.chunk_size)
     else:
         grid = _choose(survey, params, width, memory)
-    return Plan(survey, params, Path(out), grid, width, memory)
+    return Plan(survey, params, Path(out).absolute(), grid, width, memory)
 
 
 def _eligible(tile: Tile, last: bool) -> float:

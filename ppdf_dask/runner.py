@@ -54,15 +54,21 @@ def run(
     overwrite: bool = False,
     accept_changes: bool = False,
     force_unlock: bool = False,
+    stop: Callable[[], None] = nothing,
 ) -> Result:
-    """Run a plan; see `Plan.run`."""
+    """Run a plan; see `Plan.run`. `stop` is called about once a second; what it raises ends the run."""
     from ppdf_dask.result import Result
 
     store = RunStore(str(plan.out / "run.zarr"))
     if not overwrite:
         plan = _as_before(plan, store)
     plan.check()
-    with hold(store, force=force_unlock) as check:
+    with hold(store, force=force_unlock) as mine:
+
+        def check() -> None:
+            mine()
+            stop()
+
         driver = _Run(plan, client, on_event or ignore, check)
         driver.begin(overwrite, accept_changes)
         for _ in range(ROUNDS):
@@ -196,7 +202,13 @@ class _Run:
         total = sum(w.points for w in works)
         resumed = sum(w.points for w in works if w.ident in records)
         self.on_event(
-            Event(name, "stage", points=resumed, total=total, record={"tasks": len(works), "done": len(records)})
+            Event(
+                name,
+                "stage",
+                points=resumed,
+                total=total,
+                record={"tasks": len(works), "done": len(records), "resumed": sorted(records)},
+            )
         )
         if todo:
             (self.plan.out / "run.json").unlink(missing_ok=True)

@@ -88,12 +88,11 @@ def run(tiles: tuple[str, ...], out: Path, overwrite: bool, accept_changes: bool
     ppdf-dask run tiles/ --out RUN --workers 8 --resolution 0.5
     ppdf-dask run tiles/ --out RUN --scheduler tls://10.0.0.1:8786
     """
-    from ppdf_dask.cluster import default_workers, memory_per_worker
     from ppdf_dask.plan import plan as make_plan
 
     cluster = {k: options.pop(k) for k in ("workers", "scheduler", "insecure", "quiet", "json_log")}
     params = run_params(options)
-    memory = memory_per_worker(cluster["workers"] or default_workers())
+    memory = _memory(cluster)
     made = make_plan(_scan(tiles, options), params, out=out, memory=memory)
     made.check()
     if not cluster["quiet"]:
@@ -171,16 +170,30 @@ def _connect(cluster: dict[str, Any]) -> AbstractContextManager[Client]:
 
     if cluster["scheduler"]:
         return clusters.connect(cluster["scheduler"], insecure=cluster["insecure"])
-    return clusters.local(cluster["workers"])
+    return clusters.local_cluster(cluster["workers"])
+
+
+def _memory(cluster: dict[str, Any]) -> float:
+    from ppdf_dask.cluster import default_workers, memory_per_worker
+    from ppdf_dask.preflight import worker_memory
+
+    if not cluster["scheduler"]:
+        return memory_per_worker(cluster["workers"] or default_workers())
+    with _connect(cluster) as client:
+        return worker_memory(client)
 
 
 def _run(made: Plan, cluster: dict[str, Any], *, overwrite: bool, accept_changes: bool) -> Result:
     from rich.console import Console
 
+    from ppdf_dask import preflight
+    from ppdf_dask.cluster import dashboard
     from ppdf_dask.progress import listen
 
     console = Console(stderr=True)
     with _connect(cluster) as client, listen(console, quiet=cluster["quiet"], json_log=cluster["json_log"]) as listener:
         if not cluster["quiet"]:
-            console.print(f"dashboard {client.dashboard_link}", highlight=False)
+            for line in dashboard(client):
+                console.print(line, highlight=False, markup=False)
+        preflight.check(client, made)
         return made.run(client, on_event=listener, overwrite=overwrite, accept_changes=accept_changes)
