@@ -1,14 +1,21 @@
-"""Clusters that the command line starts, on loopback only, one thread per worker process."""
+"""Clusters for the command line and notebooks, safe by default: loopback only, or encrypted, or said to be insecure."""
 
 from __future__ import annotations
 
+import getpass
+import ipaddress
+import json
 import os
 import socket
-from collections.abc import Iterator
+import stat
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from ppdf_dask.errors import ClusterError
+from ppdf_dask.numbacache import ensure_cache
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -21,6 +28,12 @@ SINGLE = {
     "OPENBLAS_NUM_THREADS": "1",
 }
 """Environment of a worker: parallelism comes from processes alone, so threads must not multiply inside."""
+
+ENCRYPTED = ("tls", "wss", "inproc")
+"""Kinds of address that nobody on the way can read."""
+
+CONNECT_TIMEOUT = 20.0
+"""Seconds until a scheduler that does not answer counts as absent."""
 
 
 def memory_per_worker(workers: int) -> float:
@@ -36,7 +49,7 @@ def default_workers() -> int:
 
 
 @contextmanager
-def local(workers: int | None = None) -> Iterator[Client]:
+def local_cluster(workers: int | None = None) -> Iterator[Client]:
     """Start a local cluster and stop it at the end.
 
     Parameters
@@ -47,14 +60,17 @@ def local(workers: int | None = None) -> Iterator[Client]:
     Yields
     ------
     distributed.Client
-        Scheduler, workers and dashboard listen on 127.0.0.1 only.
+        Scheduler, workers and dashboard listen on 127.0.0.1 only. Other users of the same machine can reach that, too:
+        on a shared login node start a TLS scheduler instead (deploy/README.md).
     """
     import dask
     from distributed import Client, LocalCluster
 
     count = workers or default_workers()
+    ensure_cache()
+    before = dask.config.get("distributed.nanny.pre-spawn-environ")
     config = {
-        "distributed.nanny.pre-spawn-environ": {**dask.config.get("distributed.nanny.pre-spawn-environ"), **SINGLE},
+        "distributed.nanny.pre-spawn-environ": {**before, **SINGLE},
         "distributed.worker.daemon": True,
     }
     with (
@@ -76,39 +92,160 @@ def local(workers: int | None = None) -> Iterator[Client]:
 def connect(address: str, *, insecure: bool = False) -> Iterator[Client]:
     """Connect to a scheduler that runs already.
 
+    Certificates for ``tls://`` come from Dask's own configuration: ``distributed.comm.tls`` in a YAML file, or the
+    variables ``DASK_DISTRIBUTED__COMM__TLS__CA_FILE``, ``..__CLIENT__CERT`` and ``..__CLIENT__KEY``.
+
     Parameters
     ----------
     address : str
-        ``tcp://host:port`` or ``tls://host:port``, or the path of a scheduler file.
+        ``tls://host:port`` or ``tcp://host:port``, or the path of a scheduler file.
     insecure : bool
         Allow an unencrypted connection to another machine: whoever reaches a Dask port can run code there.
+
+    Yields
+    ------
+    distributed.Client
+        Closed at the end; the scheduler stays.
 
     Raises
     ------
     ClusterError
-        No scheduler answers, or the connection would be open.
+        No scheduler answers, its certificate or ours is refused, a private key is open to others, or the connection
+        would not be encrypted.
     """
     from distributed import Client
 
-    is_file = os.path.isfile(address)
-    if not is_file and not insecure and not address.startswith("tls://") and not _is_loopback(address):
-        raise ClusterError(
-            f"{address} is on another machine and not encrypted: whoever reaches that port can run code there. "
-            "Use a tls:// scheduler, or --insecure if its network is closed"
-        )
+    ensure_cache()
+    wanted = scheduler_file(address) if os.path.isfile(address) else address
+    check_address(wanted, insecure=insecure)
+    if wanted.startswith("tls://"):
+        _check_key()
     try:
-        client = Client(scheduler_file=address) if is_file else Client(address, timeout=20)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise ClusterError(
-            f"no scheduler answers at {address} ({error}); check the address and that it runs"
-        ) from error
+        client = Client(wanted, timeout=CONNECT_TIMEOUT)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise ClusterError(_no_answer(wanted, error)) from error
     with client:
         yield client
 
 
+def check_address(address: str, *, insecure: bool = False) -> None:
+    """Refuse an address over which code and data would travel openly.
+
+    Parameters
+    ----------
+    address : str
+        A scheduler's address.
+    insecure : bool
+        Whether the user takes the risk.
+
+    Raises
+    ------
+    ClusterError
+        For an unencrypted scheduler on another machine.
+
+    Examples
+    --------
+    >>> check_address("tcp://127.0.0.1:8786")
+    >>> check_address("tls://10.0.0.1:8786")
+    >>> check_address("tcp://10.0.0.1:8786")  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    ppdf_dask.errors.ClusterError: tcp://10.0.0.1:8786 is on another machine and not encrypted: whoever ...
+    """
+    if insecure or urlsplit(address).scheme in ENCRYPTED or _is_loopback(address):
+        return
+    raise ClusterError(
+        f"{address} is on another machine and not encrypted: whoever reaches that port can run code there. "
+        "Use a tls:// scheduler, or --insecure if its network is closed"
+    )
+
+
+def scheduler_file(path: str) -> str:
+    """Return the address that a scheduler file holds.
+
+    Raises
+    ------
+    ClusterError
+        When it holds none: the scheduler may still be starting.
+    """
+    try:
+        return str(json.loads(Path(path).read_text(encoding="utf-8"))["address"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ClusterError(f"{path} holds no scheduler's address ({error}); does the scheduler run already?") from error
+
+
+def dashboard(client: Client, environ: Mapping[str, str] = os.environ) -> list[str]:
+    """Return where the dashboard is, in lines to show.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Of the cluster.
+    environ : mapping
+        ``JUPYTERHUB_SERVICE_PREFIX`` and ``SSH_CONNECTION`` are looked at; default the process's own.
+
+    Returns
+    -------
+    list of str
+        The link as a browser needs it: behind JupyterHub the proxied one, over SSH followed by the tunnel's command.
+        Empty where there is no dashboard.
+    """
+    link = client.dashboard_link
+    if not link:
+        return []
+    parts = urlsplit(link)
+    prefix = environ.get("JUPYTERHUB_SERVICE_PREFIX")
+    if prefix and parts.scheme in ("http", "https") and parts.port:
+        place = str(parts.port) if _is_loopback(link) else f"{parts.hostname}:{parts.port}"
+        return [f"dashboard {prefix.rstrip('/')}/proxy/{place}/status"]
+    lines = [f"dashboard {link}"]
+    if "SSH_CONNECTION" in environ and parts.port:
+        there = f"{environ.get('USER') or getpass.getuser()}@{socket.getfqdn()}"
+        lines.append(
+            f"  from your own machine: ssh -N -L {parts.port}:{parts.hostname}:{parts.port} {there}, "
+            f"then http://127.0.0.1:{parts.port}/status"
+        )
+    return lines
+
+
 def _is_loopback(address: str) -> bool:
-    host = address.split("://")[-1].rsplit(":", 1)[0].strip("[]")
-    return host in ("localhost", "::1") or host.startswith("127.") or address.startswith("inproc://")
+    host = urlsplit(address if "://" in address else f"tcp://{address}").hostname or ""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _check_key() -> None:
+    """Refuse a private key that others can read."""
+    import dask
+
+    key = dask.config.get("distributed.comm.tls.client.key")
+    if not key:
+        raise ClusterError(
+            "a tls:// scheduler needs this side's certificates: set DASK_DISTRIBUTED__COMM__TLS__CA_FILE, "
+            "DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT and DASK_DISTRIBUTED__COMM__TLS__CLIENT__KEY"
+        )
+    try:
+        mode = stat.S_IMODE(os.stat(key).st_mode)
+    except OSError as error:
+        raise ClusterError(f"the private key {key} cannot be read: {error.strerror}") from error
+    if mode & 0o077:
+        raise ClusterError(f"the private key {key} has mode {mode:04o}: others can read it; chmod 600 {key}")
+
+
+def _no_answer(address: str, error: BaseException) -> str:
+    chain, cause = [str(error)], error.__cause__ or error.__context__
+    while cause is not None and len(chain) < 8:
+        chain.append(str(cause))
+        cause = cause.__cause__ or cause.__context__
+    text = " ".join(chain)
+    if "certificate" in text.lower():
+        why = next(part for part in chain if "certificate" in part.lower())
+        return f"{address} and this side do not trust each other's certificates ({why}); both need the same CA file"
+    hint = ", and whether it wants tls://" if address.startswith("tcp://") else ""
+    first = str(error) or type(error).__name__
+    return f"no scheduler answers at {address} ({first}); check the address, that it runs{hint}"
 
 
 def _port(wanted: int) -> int:
