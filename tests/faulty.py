@@ -1,0 +1,163 @@
+"""A client without a cluster, and ways to kill, stop or starve a run at a chosen moment."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import traceback
+import warnings
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from ppdf_dask.filters.ppdf import RobustParams
+from ppdf_dask.objects import ObjectStore
+from ppdf_dask.params import ChunkParams, DtmParams, RunParams
+from ppdf_dask.plan import Plan, plan
+from ppdf_dask.survey import scan
+
+
+class Inline:
+    """Runs each task at once, in this process, as a `distributed.Client` would elsewhere; counts what it runs."""
+
+    status = "running"
+    scheduler = SimpleNamespace(address="inline")
+
+    def __init__(self, fault: Callable[[str, Any], None] | None = None) -> None:
+        self.ran: list[str] = []
+        self._fault = fault
+
+    def nthreads(self) -> dict[str, int]:
+        return {"inline": 1}
+
+    def submit(self, function: Any, url: str, job: Any, fingerprint: str, *, key: str, pure: bool) -> Any:
+        self.ran.append("-".join(key.split("-")[:2]))
+        future = _Future(key)
+        try:
+            if self._fault is not None:
+                self._fault(self.ran[-1], job)
+            future.record = function(url, job, fingerprint)
+        except Exception as error:
+            future.error, future.status = error, "error"
+        return future
+
+    def cancel(self, futures: Any, force: bool) -> None:
+        pass
+
+
+class _Future:
+    def __init__(self, key: str) -> None:
+        self.key, self.status, self.record, self.error = key, "finished", None, None
+
+    def add_done_callback(self, call: Any) -> None:
+        call(self)
+
+    def result(self) -> Any:
+        return self.record
+
+    def exception(self) -> Any:
+        return self.error
+
+    def traceback(self) -> Any:
+        return self.error.__traceback__
+
+    def release(self) -> None:
+        pass
+
+
+class KilledWorker(Exception):
+    """Stands for the scheduler's verdict of this name on a task whose workers died."""
+
+
+def small_plan(tiles: Path, out: Path, **changes: Any) -> Plan:
+    """Return a plan of a few chunks with all that is derived fixed, so that a lost tile changes nothing far away."""
+    params = RunParams(
+        filter=RobustParams(cell_size=1.5),
+        chunks=ChunkParams(chunk_size=25.0, buffer=20.0),
+        dtm=DtmParams(resolution=1.0),
+    )
+    return plan(scan([tiles]), params.replace(**changes), out=out)
+
+
+def outputs(out: Path) -> dict[str, int]:
+    """Return a checksum of every file a run leaves for its user."""
+    return {
+        str(p.relative_to(out)): zlib.crc32(p.read_bytes())
+        for p in sorted(out.rglob("*"))
+        if p.is_file() and "run.zarr" not in p.parts and p.name != "run.json"
+    }
+
+
+def arrays(out: Path) -> dict[str, int]:
+    """Return a checksum of every object of the store but the ledger's, which tells times."""
+    store = out / "run.zarr"
+    return {
+        str(p.relative_to(store)): zlib.crc32(p.read_bytes())
+        for p in sorted(store.rglob("*"))
+        if p.is_file() and p.relative_to(store).parts[0] not in ("ledger", "zarr.json")
+    }
+
+
+def finished(out: Path) -> set[str]:
+    """Return the pieces of work that the ledger calls done, as ``stage-id``."""
+    ledger = out / "run.zarr" / "ledger"
+    stages = ("tile", "classify", "merge", "dtm", "cog")
+    return {f"{s}-{p.parent.name}" for s in stages for p in (ledger / s).glob("*/zarr.json")}
+
+
+@contextmanager
+def at_put(number: int, action: Callable[[str, bytes, Any], None]) -> Iterator[list[str]]:
+    """Do something in place of the `number`-th put into any store, counted from 0; yields the keys put so far.
+
+    The lock's beats come at their own times and do not count.
+    """
+    true, keys = ObjectStore.put, []
+
+    def put(self: ObjectStore, key: str, value: bytes) -> None:
+        if key.startswith("lock"):
+            return true(self, key, value)
+        keys.append(key)
+        if len(keys) - 1 == number:
+            return action(key, value, lambda: true(self, key, value))
+        return true(self, key, value)
+
+    ObjectStore.put = put
+    try:
+        yield keys
+    finally:
+        ObjectStore.put = true
+
+
+def killed(key: str, value: bytes, put: Callable[[], None]) -> None:
+    """Die as by SIGKILL, at once, with nothing cleaned up."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def full(key: str, value: bytes, put: Callable[[], None]) -> None:
+    """Find no room on the disk."""
+    raise OSError(errno.ENOSPC, "No space left on device", key)
+
+
+def in_child(call: Callable[[], Any]) -> int:
+    """Run something in a child process; return its exit status, negative for a signal."""
+    sys.stdout.flush()
+    with warnings.catch_warnings():
+        # Python warns of forking a process with threads: this child uses none of its parent's.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            call()
+            status = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(status)
+    _, raw = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(raw)

@@ -1,0 +1,243 @@
+"""Kill a run at any moment, fill its disk, damage its store: the same command goes on to the same bytes."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from faulty import Inline, arrays, at_put, finished, full, in_child, killed, outputs, small_plan
+
+from ppdf_dask.errors import DiskFullError, PartialRunError
+from ppdf_dask.params import RunParams
+from ppdf_dask.synthetic import SyntheticParams, write_survey
+
+WIDE = SyntheticParams(density=1.0, low_noise=0.001)
+
+
+@pytest.fixture(scope="session")
+def tiles(tmp_path_factory) -> Path:
+    """Two tiles of 40 m that share a chunk, five thousand points."""
+    folder = tmp_path_factory.mktemp("tiny")
+    write_survey(folder, WIDE, extent=(600, 600, 680, 640), tile_size=40, truth=False)
+    return folder / "tiles"
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tiles, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    client = Inline()
+    with at_put(-1, killed) as keys:
+        small_plan(tiles, out).run(client)
+    assert finished(out) == set(client.ran)
+    (out / "puts.txt").write_text(str(len(keys)))
+    return out
+
+
+def puts(undisturbed: Path) -> int:
+    return int((undisturbed / "puts.txt").read_text())
+
+
+def same(out: Path, undisturbed: Path) -> bool:
+    expected = outputs(undisturbed)
+    del expected["puts.txt"]
+    return outputs(out) == expected and arrays(out) == arrays(undisturbed)
+
+
+def resume(tiles: Path, out: Path, **options: bool) -> list[str]:
+    """Go on with a run; check that only unfinished work is done, and return it."""
+    done = finished(out)
+    client = Inline()
+    small_plan(tiles, out).run(client, **options)
+    assert not done & set(client.ran), "finished work was done again"
+    assert finished(out) == done | set(client.ran)
+    return client.ran
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_f31_killed_again_and_again_at_random(tiles, undisturbed, tmp_path, seed):
+    """Six kills a seed, each anywhere in what is left; then one resume to the end."""
+    rng = np.random.default_rng(seed)
+    kills = 0
+    while kills < 6:
+        moment = int(rng.integers(0, max(4, puts(undisturbed) // 3)))
+
+        def life(moment: int = moment) -> None:
+            with at_put(moment, killed):
+                small_plan(tiles, tmp_path).run(Inline())
+
+        if in_child(life) == -9:
+            kills += 1
+            assert not (tmp_path / "run.json").exists()
+        else:  # It came to its end before the moment: begin anew.
+            assert same(tmp_path, undisturbed)
+            shutil.rmtree(tmp_path)
+    resume(tiles, tmp_path)
+    assert same(tmp_path, undisturbed)
+    assert not list(tmp_path.glob("laz/.*"))
+
+
+@pytest.mark.slow
+def test_f31_killed_at_every_single_put(tiles, undisturbed, tmp_path):
+    for moment in range(puts(undisturbed)):
+        out = tmp_path / str(moment)
+
+        def life(moment: int = moment, out: Path = out) -> None:
+            with at_put(moment, killed):
+                small_plan(tiles, out).run(Inline())
+
+        assert in_child(life) == -9
+        resume(tiles, out)
+        assert same(out, undisturbed), moment
+        shutil.rmtree(out)
+
+
+@pytest.mark.parametrize("stage", ["merge", "cog"])
+def test_f46_killed_while_a_file_is_published(tiles, undisturbed, tmp_path, stage, monkeypatch):
+    """At `os.replace`: the file is whole under its temporary name, or under its own without a record."""
+    import os
+
+    for late in (False, True):
+        out = tmp_path / str(late)
+        suffix = ".laz" if stage == "merge" else ".tif"
+
+        def life(late: bool = late, out: Path = out, suffix: str = suffix) -> None:
+            true = os.replace
+
+            def replace(source: object, target: object) -> None:
+                if str(target).endswith(suffix):
+                    if late:
+                        true(source, target)
+                    os.kill(os.getpid(), 9)
+                true(source, target)
+
+            os.replace = replace
+            small_plan(tiles, out).run(Inline())
+
+        assert in_child(life) == -9
+        assert bool(list(out.rglob(f"*{suffix}"))) == late or list(out.rglob(f".*{suffix}*"))
+        resume(tiles, out)
+        assert same(out, undisturbed)
+
+
+def test_f39_f34_work_that_runs_twice_at_once_does_no_harm(tiles, undisturbed, tmp_path):
+    """A second writer of the same piece interleaves with the first at every put, as a stopped worker that wakes up."""
+
+    class Twice(Inline):
+        def submit(self, function, url, job, fingerprint, **rest):
+            def both(*arguments):
+                first = function(*arguments)
+                with at_put(-1, killed) as keys:
+                    function(*arguments)
+                for moment in (0, len(keys) // 2, len(keys) - 1):
+                    with at_put(moment, lambda key, value, put: (function(*arguments), put())):
+                        function(*arguments)
+                return first
+
+            return super().submit(both, url, job, fingerprint, **rest)
+
+    small_plan(tiles, tmp_path).run(Twice())
+    assert same(tmp_path, undisturbed)
+
+
+@pytest.mark.parametrize("moment", [9, 20, 40, 60, 75])
+def test_f35_full_disk_in_the_store_ends_the_run_and_it_goes_on(tiles, undisturbed, tmp_path, moment):
+    with at_put(moment, full), pytest.raises((DiskFullError, OSError)) as caught:
+        small_plan(tiles, tmp_path).run(Inline())
+    assert "No space left on device" in str(caught.value)
+    assert not (tmp_path / "run.json").exists()
+    resume(tiles, tmp_path)
+    assert same(tmp_path, undisturbed)
+
+
+def test_f35_full_disk_in_the_temporary_folder(tiles, undisturbed, tmp_path, monkeypatch):
+    """Fragments are spilled at once, into a place where no file may grow."""
+    import resource
+    import signal
+
+    from ppdf_dask import tiler
+
+    monkeypatch.setattr(tiler, "SPILL_POINTS", 10)
+
+    def life() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (8000, 8000))
+        with pytest.raises(DiskFullError, match="temporary folder"):
+            small_plan(tiles, tmp_path).run(Inline())
+
+    assert in_child(life) == 0
+    assert "tile-s_000000" not in finished(tmp_path)
+    monkeypatch.undo()
+    resume(tiles, tmp_path)
+    assert same(tmp_path, undisturbed)
+
+
+def test_f35_full_disk_under_everything(tiles, undisturbed, tmp_path):
+    """A real small disk: it fills at some moment of some stage; more room, the same command, the same bytes."""
+    import os
+    import subprocess
+
+    if os.getuid() != 0:
+        pytest.skip("only root may mount a small disk")
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=160k", "tmpfs", tmp_path], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("no leave to mount a small disk here")
+    try:
+        stopped = 0
+        for size in (160, 320, 640, 1280, 20_000):
+            subprocess.run(["mount", "-o", f"remount,size={size}k", tmp_path], check=True)
+            try:
+                resume(tiles, tmp_path / "run")
+            except (DiskFullError, OSError) as error:
+                assert "o space left" in str(error)
+                stopped += 1
+                for path in (tmp_path / "run" / "laz").glob("*.laz"):
+                    assert outputs(undisturbed)[f"laz/{path.name}"] == outputs(tmp_path / "run")[f"laz/{path.name}"]
+        assert stopped
+        assert same(tmp_path / "run", undisturbed)
+    finally:
+        subprocess.run(["umount", "-l", tmp_path], check=True)
+
+
+def test_f33_work_that_kills_its_workers_is_tried_alone_and_given_up(tiles, undisturbed, tmp_path):
+    from faulty import KilledWorker
+
+    def fault(key, job):
+        if key == "classify-c_0025_0024":
+            raise KilledWorker
+
+    client = Inline(fault)
+    with pytest.raises(PartialRunError, match=r"c_0025_0024 \(needs about \d+ MB, a worker has \d+ MB\)"):
+        small_plan(tiles, tmp_path).run(client)
+    assert client.ran.count("classify-c_0025_0024") == 2
+    assert client.ran.index("classify-c_0026_0024") < len(client.ran)
+    assert {"classify-c_0024_0024", "classify-c_0026_0024"} <= finished(tmp_path)
+    assert resume(tiles, tmp_path)[0] == "classify-c_0025_0024"
+    assert same(tmp_path, undisturbed)
+
+
+def test_what_fails_by_chance_is_tried_again(tiles, undisturbed, tmp_path):
+    times = []
+
+    def fault(key, job):
+        if key == "merge-s_000000" and len(times) < 2:
+            times.append(key)
+            raise ConnectionResetError("a storage server had a cold")
+
+    events = []
+    small_plan(tiles, tmp_path).run(Inline(fault), on_event=events.append)
+    assert [e.state for e in events if e.ident == "s_000000" and e.stage == "merge"] == ["retried", "retried", "done"]
+    assert same(tmp_path, undisturbed)
+
+
+def test_overwrite_starts_anew_even_when_killed(tiles, undisturbed, tmp_path):
+    small_plan(tiles, tmp_path, dtm=RunParams().dtm.replace(resolution=2.0)).run(Inline())
+
+    def life() -> None:
+        with at_put(3, killed):
+            small_plan(tiles, tmp_path).run(Inline(), overwrite=True)
+
+    assert in_child(life) == -9
+    small_plan(tiles, tmp_path).run(Inline(), overwrite=True)
+    assert same(tmp_path, undisturbed)
