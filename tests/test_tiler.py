@@ -25,6 +25,7 @@ coordinate = st.one_of(edge, st.integers(-3 * SIZE, 3 * SIZE))
 places = st.lists(st.tuples(coordinate, coordinate), min_size=0, max_size=60)
 
 
+@settings(deadline=None)
 @given(places)
 def test_each_point_has_exactly_one_owner(xy):
     x, y = (np.array([p[k] for p in xy], np.int64) for k in (0, 1))
@@ -37,6 +38,7 @@ def test_each_point_has_exactly_one_owner(xy):
     assert (seen == 1).all()
 
 
+@settings(deadline=None)
 @given(places, st.integers(0, SIZE))
 def test_buffers_hold_what_lies_around_the_core(xy, buffer):
     x, y = (np.array([p[k] for p in xy], np.int64) for k in (0, 1))
@@ -57,6 +59,7 @@ def _inside(rect: Rect, x: int, y: int) -> bool:
     return rect.x0 <= x < rect.x1 and rect.y0 <= y < rect.y1
 
 
+@settings(deadline=None)
 @given(st.lists(st.booleans(), min_size=1, max_size=200))
 def test_density_cells_survive_packing(cells):
     mask = np.array(cells)
