@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ppdf_dask.cli.show import chosen, chosen_filter, json_option, score_option, show, tracked
+from ppdf_dask.cli.show import chosen, chosen_filter, json_option, score_option, show, ticking, tracked
 
 
 @click.group()
@@ -37,3 +37,43 @@ def accuracy(data: Path, score: str | None, as_json: bool, **options: Any) -> No
     params = chosen(**options)
     rows = [measure(read(path, score), params) for path in tracked(files_in(data), "clouds")]
     show(AccuracyTable(params, tuple(rows)), as_json=as_json)
+
+
+@benchmark.command()
+@click.argument("files", nargs=-1, type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar="[FILES]...")
+@click.option(
+    "--filter",
+    "names",
+    multiple=True,
+    default=("ppdf:robust", "ppdf:paper"),
+    show_default=True,
+    metavar="NAME[:PROFILE]",
+    help="What to measure; may be repeated; all: every registered filter's default profile.",
+)
+@click.option("--repeat", type=click.IntRange(1), default=3, show_default=True, help="Rounds; medians are reported.")
+@click.option("--memory/--no-memory", default=True, show_default=True, help="Measure memory too.")
+@click.option("--compilation", is_flag=True, help="Measure compilation too, with a cold and a warm cache.")
+@json_option
+def speed(
+    files: tuple[Path, ...], names: tuple[str, ...], repeat: int, memory: bool, compilation: bool, as_json: bool
+) -> None:
+    """Time decoding, copying, the filters alone and the whole of classify, in processor seconds of one core.
+
+    Rounds are interleaved, so that ratios hold even on a busy machine. Without FILES: two synthetic tiles.
+
+    \b
+    ppdf-dask benchmark speed tile.laz
+    ppdf-dask benchmark speed dense.laz sparse.laz --filter all --json
+    """
+    import tempfile
+
+    from ppdf_dask.experiments import speed as study
+
+    choices = [choice for name in names for choice in study.Choice.of(name)]
+    with tempfile.TemporaryDirectory() as folder:
+        paths = list(files) or study.synthetic_files(Path(folder))
+        steps = 1 + (2 + 2 * len(choices)) * repeat + len(choices)
+        with ticking(steps * len(paths), "measure") as tick:
+            found = tuple(study.measure(path, choices, repeat=repeat, memory=memory, tick=tick) for path in paths)
+    compiled = {c.name: study.compilation(c) for c in tracked(choices, "compile")} if compilation else {}
+    show(study.SpeedTable(found, compiled), as_json=as_json)

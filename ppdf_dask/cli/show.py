@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -79,6 +80,18 @@ def tracked(items: Sequence[T], title: str) -> Iterator[T]:
 
     console = Console(stderr=True)
     yield from track(items, description=title, console=console, disable=not console.is_terminal, transient=True)
+
+
+@contextmanager
+def ticking(steps: int, title: str) -> Iterator[Callable[[str], None]]:
+    """Give a function to be called with a name after each of `steps` steps; a terminal's error channel shows it."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task(title, total=steps)
+        yield lambda name: progress.update(task, advance=1, description=f"{title}: {name}")
 
 
 def show(found: Study, *, as_json: bool) -> None:
