@@ -17,6 +17,8 @@ COMMANDS = {
     "classify": ("jobs", "one tile in memory, no cluster"),
     "evaluate": ("studies", "compare a classified tile with its reference"),
     "benchmark": ("benchmark", "accuracy on labelled clouds; speed"),
+    "compare": ("compare", "every filter on sites with known ground: errors, terrain models, times"),
+    "sites": ("compare", "slope, canopy cover and canopy height of sites with known ground"),
 }
 """Command name to the module of this package that holds it, loaded when it is called, and what it does."""
 
