@@ -33,11 +33,15 @@ _WHERE = {
     "RobustParams": "filters.ppdf.robust.params",
     "PaperParams": "filters.ppdf.paper.params",
     "PpdfError": "errors",
+    "Submission": "submit",
+    "LiveMap": "widget",
+    "local_cluster": "cluster",
 }
 
 __all__ = [*_WHERE, "__version__"]
 
 if TYPE_CHECKING:
+    from ppdf_dask.cluster import local_cluster
     from ppdf_dask.errors import PpdfError
     from ppdf_dask.evaluate import evaluate
     from ppdf_dask.filters import classify_ground
@@ -48,7 +52,9 @@ if TYPE_CHECKING:
     from ppdf_dask.plan import Plan, plan
     from ppdf_dask.result import Result
     from ppdf_dask.single import classify_tile
+    from ppdf_dask.submit import Submission
     from ppdf_dask.survey import Survey, scan
+    from ppdf_dask.widget import LiveMap
 
 
 def __getattr__(name: str) -> Any:

@@ -70,6 +70,12 @@ class ResumeError(StoreError):
     exit_code = 2
 
 
+class StoppedError(PpdfError):
+    """The user stopped the run; what is done is in the ledger."""
+
+    exit_code = 130
+
+
 class PartialRunError(PpdfError):
     """The run ended, but some chunks or tiles could not be done; they are listed by name."""
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from ppdf_dask.events import Event
     from ppdf_dask.result import Result
+    from ppdf_dask.submit import Submission
 
 WORKER_MB = 350.0
 """Resident size of a worker that has imported everything and compiled its kernels, measured."""
@@ -193,6 +194,12 @@ class Plan:
             accept_changes=accept_changes,
             force_unlock=force_unlock,
         )
+
+    def submit(self, client: Client, *, overwrite: bool = False, accept_changes: bool = False) -> Submission:
+        """Hand the plan to a cluster that outlives this process and return at once; see `submit.submit`."""
+        from ppdf_dask.submit import submit
+
+        return submit(self, client, overwrite=overwrite, accept_changes=accept_changes)
 
     def facts(self) -> dict[str, Any]:
         """Return the plan as plain JSON."""

@@ -19,6 +19,11 @@ COMMANDS = {
     "benchmark": ("benchmark", "accuracy on labelled clouds; speed"),
     "compare": ("compare", "every filter on sites with known ground: errors, terrain models, times"),
     "sites": ("compare", "slope, canopy cover and canopy height of sites with known ground"),
+    "submit": ("remote", "hand a run to a cluster and return at once"),
+    "attach": ("remote", "progress of a submitted run; no scheduler needed"),
+    "logs": ("remote", "what the driver of a submitted run wrote down"),
+    "cancel": ("remote", "stop a submitted run; submitting again goes on"),
+    "doctor": ("remote", "what a bug report needs"),
 }
 """Command name to the module of this package that holds it, loaded when it is called, and what it does."""
 
