@@ -14,7 +14,11 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from ppdf_dask.numbacache import ensure_cache
+
 __version__ = "0.1.0"
+
+ensure_cache()
 
 _WHERE = {
     "scan": "survey",

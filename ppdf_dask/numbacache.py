@@ -1,64 +1,77 @@
-"""A place for compiled kernels where neither the package's folder nor the home can be written."""
+"""Where compiled kernels are kept: one folder per version of this code.
+
+numba notices when the file of a kernel changed, but not when a module it calls did, and then runs old machine code. So
+the folder's name carries the state of all source files. It also gives numba a place where the package and the home are
+both read-only, as on clusters.
+"""
 
 from __future__ import annotations
 
 import os
-import stat
 import sys
 import tempfile
-from contextlib import suppress
+import zlib
 from pathlib import Path
+
+VARIABLE = "NUMBA_CACHE_DIR"
 
 
 def ensure_cache() -> str | None:
-    """Give Numba a private folder when it would find none; it would refuse to import any cached kernel then.
+    """Point numba to the folder of this code, unless the user chose one or numba is loaded already.
 
-    The folder is one per user and machine, open to nobody else (what lies there is executed), and passed on to child
-    processes by ``NUMBA_CACHE_DIR``. To be called before the kernels are imported.
+    Called when `ppdf_dask` is imported, before any kernel is; child processes inherit it.
 
     Returns
     -------
     str or None
-        The folder, or None where Numba's own choice is writable or the user has made one.
+        The folder, or None where the choice stands already.
     """
-    if os.environ.get("NUMBA_CACHE_DIR"):
+    if os.environ.get(VARIABLE) or "numba" in sys.modules:
         return None
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    if _writable(Path(__file__).parent / "__pycache__") or _writable(home / "numba"):
-        return None
-    folder = os.environ["NUMBA_CACHE_DIR"] = private_folder()
-    if "numba" in sys.modules:
-        import numba
-
-        numba.config.CACHE_DIR = folder
-    return folder
+    folder = _folder()
+    if folder is not None:
+        os.environ[VARIABLE] = str(folder)
+    return None if folder is None else str(folder)
 
 
-def private_folder() -> str:
-    """Return a folder below the temporary one that only this user can enter, the same for all processes of a machine.
-
-    A folder of that name that is another's, or open to others, is not used: a new one is made instead.
+def state(package: Path) -> str:
+    """Return eight hexadecimal digits that change with any source file below a folder.
 
     Examples
     --------
-    >>> oct(os.stat(private_folder()).st_mode & 0o777)
-    '0o700'
+    >>> state(Path(__file__).parent) == state(Path(__file__).parent)
+    True
     """
-    name = f"ppdf-dask-numba-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
-    folder = Path(tempfile.gettempdir()) / name
-    with suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    found = folder.lstat()
-    mine = not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not found.st_mode & 0o077)
-    if stat.S_ISDIR(found.st_mode) and mine:
-        return str(folder)
-    return tempfile.mkdtemp(prefix=f"{name}-")
+    crc = 0
+    for path in sorted(package.rglob("*.py")):
+        found = path.stat()
+        crc = zlib.crc32(f"{path.relative_to(package)} {found.st_size} {found.st_mtime_ns}".encode(), crc)
+    return f"{crc:08x}"
 
 
-def _writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
+def _folder() -> Path | None:
+    name = f"numba-{state(Path(__file__).parent)}"
+    for base in (_user_cache() / "ppdf_dask", Path(tempfile.gettempdir()) / f"ppdf_dask-{_user()}"):
+        try:
+            base.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # In a folder that all may write to, somebody else's would run his code as ours.
+            if base.is_symlink() or (hasattr(os, "getuid") and base.stat().st_uid != os.getuid()):
+                continue
+            (base / name).mkdir(mode=0o700, exist_ok=True)
+            with tempfile.TemporaryFile(dir=base / name):
+                return base / name
+        except OSError:
+            continue
+    return None
+
+
+def _user_cache() -> Path:
+    chosen = os.environ.get("XDG_CACHE_HOME")
+    if chosen:
+        return Path(chosen)
+    home = os.environ.get("HOME") or os.environ.get("USERPROFILE")
+    return Path(home) / ".cache" if home else Path(tempfile.gettempdir()) / f"ppdf_dask-{_user()}"
+
+
+def _user() -> str:
+    return str(os.getuid()) if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
