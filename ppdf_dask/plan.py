@@ -45,6 +45,12 @@ CHUNK_SIZES = (50, 100, 150, 200, 250, 300, 400, 500, 750, 1000, 1250, 1500, 200
 FEW_POINTS = 500_000
 """A chunk below this is not worth cutting further to feed more workers."""
 
+MOST_POINTS = 1_250_000
+"""Points of a chunk's core above which larger chunks save little buffer work, while memory and the tail of a run grow."""
+
+MANY_BUFFERS = 4
+"""A chunk is made at least so many buffers wide where memory allows: then buffers are at most 5/4 of the core's points."""
+
 
 @dataclass(frozen=True)
 class ChunkEstimate:
@@ -335,13 +341,16 @@ def _area(a: Rect, b: Rect) -> int:
 
 
 def _choose(survey: Survey, params: RunParams, buffer: int, memory: float) -> ChunkGrid:
-    """Take the largest edge whose densest chunk fits the memory and leaves some chunks to share out."""
+    """Take the largest edge whose densest chunk fits the memory and has points enough, but not more.
+
+    Enough does not grow with the survey, so that the memory of a worker and the time per point do not either.
+    """
     per_point = 24.0 + filters.of(params.filter).bytes_per_point
     fits = (0.6 * memory - WORKER_MB * 1e6) / per_point
     last = params.returns == "last"
     total = sum(_eligible(t, last) for t in survey.tiles)
-    enough = max(total / 8, FEW_POINTS)
     densest = max((_eligible(t, last) / max(_extent(t), 1) for t in survey.tiles), default=0.0)
+    enough = max(min(max(total / 8, FEW_POINTS), MOST_POINTS), densest * (MANY_BUFFERS * buffer) ** 2)
     chosen = CHUNK_SIZES[0]
     for size in CHUNK_SIZES:
         edge = size * MM
