@@ -1,7 +1,7 @@
 """Where compiled kernels are kept: one folder per version of this code.
 
 numba notices when the file of a kernel changed, but not when a module it calls did, and then runs old machine code. So
-the folder's name carries the state of all source files. It also gives numba a place where the package and the home are
+the folder's name carries the state of all modules that compile. It also gives numba a place where the package and the home are
 both read-only, as on clusters.
 """
 
@@ -35,7 +35,7 @@ def ensure_cache() -> str | None:
 
 
 def state(package: Path) -> str:
-    """Return eight hexadecimal digits that change with any source file below a folder.
+    """Return eight hexadecimal digits that change with the text of any module that compiles something.
 
     Examples
     --------
@@ -44,8 +44,9 @@ def state(package: Path) -> str:
     """
     crc = 0
     for path in sorted(package.rglob("*.py")):
-        found = path.stat()
-        crc = zlib.crc32(f"{path.relative_to(package)} {found.st_size} {found.st_mtime_ns}".encode(), crc)
+        text = path.read_bytes()
+        if b"import njit" in text or b"compiled import" in text:
+            crc = zlib.crc32(text, zlib.crc32(str(path.relative_to(package)).encode(), crc))
     return f"{crc:08x}"
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import ppdf_dask
 from ppdf_dask.numbacache import state
 
 PROGRAM = "import os, ppdf_dask; print(os.environ.get('NUMBA_CACHE_DIR', ''))"
@@ -22,14 +23,24 @@ def chosen(**environment: str) -> Path:
     return Path(shown.stdout.strip())
 
 
-def test_any_changed_source_changes_the_folder(tmp_path):
+def test_any_changed_kernel_changes_the_folder(tmp_path):
     (tmp_path / "inner").mkdir()
     for name in ("a.py", "inner/b.py"):
-        (tmp_path / name).write_text("x = 1\n")
+        (tmp_path / name).write_text("from numba import njit\nx = 1\n")
+    (tmp_path / "plain.py").write_text("x = 1\n")
     before = state(tmp_path)
+    (tmp_path / "plain.py").write_text("x = 22\n")
     assert state(tmp_path) == before
-    (tmp_path / "inner/b.py").write_text("x = 22\n")
+    (tmp_path / "inner/b.py").write_text("from numba import njit\nx = 2\n")
     assert state(tmp_path) != before
+
+
+def test_every_module_that_uses_numba_is_looked_at():
+    package = Path(ppdf_dask.__file__).parent
+    for path in package.rglob("*.py"):
+        text = path.read_text()
+        if "@njit" in text or "@leaf" in text:
+            assert "import njit" in text or "compiled import" in text, path
 
 
 def test_the_user_s_choice_wins(tmp_path):
