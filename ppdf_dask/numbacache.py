@@ -1,8 +1,8 @@
 """Where compiled kernels are kept: one folder per version of this code.
 
 numba notices when the file of a kernel changed, but not when a module it calls did, and then runs old machine code. So
-the folder's name carries the state of all modules that compile. It also gives numba a place where the package and the home are
-both read-only, as on clusters.
+the folder's name carries the state of all modules that compile. It also gives numba a place where the package and the
+home are both read-only, as on clusters.
 """
 
 from __future__ import annotations
