@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from ppdf_dask.errors import ClusterError
-from ppdf_dask.numbacache import ensure_cache
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -67,7 +66,6 @@ def local_cluster(workers: int | None = None) -> Iterator[Client]:
     from distributed import Client, LocalCluster
 
     count = workers or default_workers()
-    ensure_cache()
     before = dask.config.get("distributed.nanny.pre-spawn-environ")
     config = {
         "distributed.nanny.pre-spawn-environ": {**before, **SINGLE},
@@ -115,7 +113,6 @@ def connect(address: str, *, insecure: bool = False) -> Iterator[Client]:
     """
     from distributed import Client
 
-    ensure_cache()
     wanted = scheduler_file(address) if os.path.isfile(address) else address
     check_address(wanted, insecure=insecure)
     if wanted.startswith("tls://"):

@@ -8,7 +8,6 @@ import shutil
 import tempfile
 from typing import TYPE_CHECKING, Any
 
-from ppdf_dask.numbacache import ensure_cache
 from ppdf_dask.preflight import versions
 
 if TYPE_CHECKING:
@@ -36,14 +35,13 @@ def facts(dask_worker: Any = None) -> dict[str, Any]:
     if dask_worker is not None:
         limit, threads = dask_worker.memory_manager.memory_limit, dask_worker.state.nthreads
         memory += f", worker {limit / 1e9:.1f} GB, {threads} threads" if limit else f", no limit, {threads} threads"
-    private = ensure_cache()
     return {
         "versions": versions(),
         "machine": f"{platform.system()} {platform.release()} {platform.machine()}, Python {platform.python_version()}",
         "processors": os.cpu_count(),
         "memory": memory,
         "free disk": f"{shutil.disk_usage(tempfile.gettempdir()).free / 1e9:.1f} GB for temporary files",
-        "kernel cache": "private: neither the package nor the home can be written" if private else "as Numba chooses",
+        "kernel cache": "in a folder of its own" if os.environ.get("NUMBA_CACHE_DIR") else "beside the package",
         "filters": {e.name: "found" for e in sorted(entry_points(group="ppdf_dask.filters"), key=lambda e: e.name)},
     }
 

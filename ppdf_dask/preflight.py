@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 
 from ppdf_dask import __version__
 from ppdf_dask.errors import ClusterError, PpdfError
-from ppdf_dask.numbacache import ensure_cache
 from ppdf_dask.tiles import Tile
 
 if TYPE_CHECKING:
@@ -286,7 +285,6 @@ def _try_folder(out: Path, token: str, note: str, faults: list[tuple[str, str, s
 def _try_kernels(faults: list[tuple[str, str, str]]) -> None:
     """Import a cached kernel: that is where a missing place for compiled code shows."""
     try:
-        ensure_cache()
         import ppdf_dask.filters.ppdf.hashing  # noqa: F401
     except Exception as error:
         found = f"{type(error).__name__}: {error}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from html import escape
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ppdf_dask.events import Event
@@ -97,9 +98,8 @@ class LiveMap:
         ImportError
             Outside of IPython.
         """
-        from IPython.display import HTML, display
-
-        self._handle = display(HTML(self.html()), display_id=True)
+        show: Any = import_module("IPython.display")
+        self._handle = show.display(show.HTML(self.html()), display_id=True)
 
     def _repr_html_(self) -> str:
         return self.html()
@@ -108,9 +108,8 @@ class LiveMap:
         began = time.monotonic()
         if self._handle is None or (began < self._next and not now):
             return
-        from IPython.display import HTML
-
-        self._handle.update(HTML(self.html()))
+        show: Any = import_module("IPython.display")
+        self._handle.update(show.HTML(self.html()))
         end = time.monotonic()
         self._next = end + max(self._every, 20 * (end - began))
 
