@@ -159,6 +159,8 @@ class _Flight:
     @contextlib.contextmanager
     def _cluster_faults(self, work: Work | None) -> Iterator[None]:
         """Name a lost scheduler as what it is."""
+        if self.client.status != "running":
+            raise self._lost(work)
         try:
             yield
         except (OSError, TimeoutError, RuntimeError) as error:
