@@ -120,7 +120,7 @@ def test_cancel_stops_and_the_same_submission_goes_on(small_survey, cluster, tmp
 
 
 def test_a_lost_driver_is_started_again_elsewhere(small_survey, cluster, tmp_path, reference):
-    made = small(small_survey, tmp_path / "run", 15.0)
+    made = small(small_survey, tmp_path / "run", 20.0)
     with Client(cluster.scheduler_address) as client:
         submission = made.submit(client)
         wait_for(lambda: sum(e.stage == "classify" and e.state == "done" for e in submission.events()) >= 2)
@@ -131,7 +131,7 @@ def test_a_lost_driver_is_started_again_elsewhere(small_survey, cluster, tmp_pat
 
 
 def test_a_folder_in_use_is_refused(small_survey, cluster, tmp_path):
-    made = small(small_survey, tmp_path / "run", 15.0)
+    made = small(small_survey, tmp_path / "run", 20.0)
     with Client(cluster.scheduler_address) as client:
         submission = made.submit(client)
         wait_for(lambda: submission.state()["state"] == "running")
