@@ -1,6 +1,7 @@
 """The robust profile: proof against cutting, order, duplicates, degenerate input."""
 
 import numpy as np
+import oracle_robust
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,7 +11,7 @@ from ppdf_dask.filters import classify_ground, get
 from ppdf_dask.filters.cloud import Cloud, Density, cloud_from_grid
 from ppdf_dask.filters.ppdf.robust import windows
 from ppdf_dask.filters.ppdf.robust.classify import classify
-from ppdf_dask.filters.ppdf.robust.params import RobustParams
+from ppdf_dask.filters.ppdf.robust.params import STEPS, RobustParams
 from ppdf_dask.grid import Rect
 
 SMALL = RobustParams(cell_size=1.0, refinement=1, search_radius=6.0, largest_building=24.0, passes=3)
@@ -46,6 +47,20 @@ def crop(points, rect):
 
 
 seeds = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=seeds,
+    snap=st.sampled_from([1, 500]),
+    params=st.sampled_from([SMALL, FINE]),
+    steps=st.sampled_from([STEPS, *(tuple(s for s in STEPS if s != left_out) for left_out in STEPS)]),
+)
+def test_every_step_does_what_the_plain_oracle_does(seed, snap, params, steps):
+    points = scene(seed, n=450, side=50.0, snap=snap)
+    params = params.replace(steps=steps, largest_building=15.0)
+    got = classify(cloud_from_grid(*points.T), params).ground
+    assert got.tolist() == oracle_robust.classify([tuple(p) for p in points.tolist()], params)
 
 
 @settings(max_examples=60, deadline=None)

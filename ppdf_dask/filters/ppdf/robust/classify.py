@@ -134,7 +134,8 @@ def _grow(cells: Cells, params: RobustParams) -> npt.NDArray[np.uint8]:
     """Grow the references over the low points in synchronous passes (step 7); return the new state."""
     limit = round(params.search_radius * MM)
     state, after = cells.state, np.empty_like(cells.state)
-    for _ in range(params.passes):
+    looked, news = np.empty(len(state), np.uint8), np.empty(len(state), np.int32)
+    for number in range(params.passes):
         changed = grow(
             cells.width,
             cells.cell,
@@ -152,6 +153,9 @@ def _grow(cells: Cells, params: RobustParams) -> npt.NDArray[np.uint8]:
             0.0,
             0.0,
             1,
+            number == 0,
+            looked,
+            news,
             after,
         )
         if not changed:
@@ -181,7 +185,7 @@ def _label(
             cells.height,
             cell,
         )
-        width, cell, parts = 2 * width, cell // 2, 2
+        width, cell, parts, limit = 2 * width, cell // 2, 2, limit // 2
         state = _grow_fine(width, cell, pos, state, rough, params)
     ground, unproven = np.empty(cloud.n_core, np.bool_), np.empty(cloud.n_core, np.bool_)
     label(
@@ -221,10 +225,11 @@ def _grow_fine(
     rough: npt.NDArray[np.int32],
     params: RobustParams,
 ) -> npt.NDArray[np.uint8]:
-    """Growth over the finer cells with a tolerance that follows the roughness, and its cleaning (step 10)."""
-    limit = round(params.search_radius * MM)
+    """Growth over the finer cells with a tolerance that follows the roughness (step 10)."""
+    limit = round(params.search_radius * MM) // 2
     rings, after = -(-limit // cell), np.empty_like(state)
-    for _ in range(params.fine_passes):
+    looked, news = np.empty(len(state), np.uint8), np.empty(len(state), np.int32)
+    for number in range(params.fine_passes):
         grow(
             width,
             cell,
@@ -242,10 +247,10 @@ def _grow_fine(
             params.fine_roughness,
             ROUGH_MOST,
             2,
+            number == 0,
+            looked,
+            news,
             after,
         )
         state, after = after, state
-    if "cleaning" in params.steps:
-        clean(width, cell, pos, state, rings, limit * limit, True, np.empty(len(state), np.int32), after)
-        state = after
     return state

@@ -45,14 +45,19 @@ def grow(
     rough_factor: Any,
     rough_most: Any,
     parts: Any,
+    first: Any,
+    looked: Any,
+    news: Any,
     after: Any,
 ) -> Any:
     """Do one synchronous pass: `after` gets the new state; return how many states changed.
 
-    `rough` holds the roughness (mm) of the coarse cells, `parts` x `parts` of these cells make one of them; an empty
-    array stands for none.
+    After the first pass a cell is tested again only where something changed within the rings (`looked`) its search
+    visited; `news` is the summed-area table of the changes of the pass before, and of this one in the end. `rough`
+    holds the roughness (mm) of the coarse cells, `parts` x `parts` of these cells make one of them; an empty array
+    stands for none.
     """
-    found = np.empty(4, np.int64)
+    found = np.empty(9, np.int64)
     soft = 0.1 * (cell * 1e-3) ** 2
     changed = 0
     for k in range(len(state)):
@@ -60,8 +65,16 @@ def grow(
         after[k] = s
         if not s & LOW or s & ROOF or s & (REF | UNPROVEN) == REF:
             continue
+        if not first:
+            e = looked[k]
+            a = k - (e + 1) * width - e - 1
+            b = k + e * width - e - 1
+            wide = 2 * e + 1
+            if news[b + wide] - news[a + wide] == news[b] - news[a]:
+                continue
         x, y, z = np.int64(pos[k, 0]), np.int64(pos[k, 1]), np.int64(pos[k, 2])
         unknown = _nearest_others(state, pos, width, cell, k, x, y, rings, limit2, found)
+        looked[k] = found[4]
         n, r, slope, d, step = height_above(pos, x, y, z, found, soft)
         least = most = 0.0
         if len(rough) > 0:
@@ -82,6 +95,12 @@ def grow(
         if s != state[k]:
             changed += 1
             after[k] = s
+    height = len(state) // width
+    for row in range(height):
+        total = 0
+        for k in range(row * width, row * width + width):
+            total += state[k] != after[k]
+            news[k] = total + (news[k - width] if row > 0 else 0)
     return changed
 
 
@@ -94,7 +113,7 @@ def clean(
     `after` gets the new state, `residuals` the heights (mm) of those that stay. Without `drop` only the residuals are
     taken.
     """
-    found = np.empty(4, np.int64)
+    found = np.empty(9, np.int64)
     soft = 0.1 * (cell * 1e-3) ** 2
     for k in range(len(state)):
         s = state[k]

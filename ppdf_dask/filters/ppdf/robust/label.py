@@ -44,7 +44,7 @@ def label(
     `of_point`, `floor`, `known` (their states) and `rough` speak of the coarse cells; `width`, `cell`, `pos` and
     `state` of the fine ones, `parts` x `parts` to a coarse one.
     """
-    found = np.empty(4, np.int64)
+    found = np.empty(9, np.int64)
     soft = 0.1 * (cell * 1e-3) ** 2
     for i in range(n_core):
         ground[i] = False

@@ -14,61 +14,49 @@ from ppdf_dask.filters.ppdf.robust.cells import REF, UNPROVEN
 def nearest(
     state: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, rings: Any, limit2: Any, found: Any
 ) -> Any:
-    """Find the nearest reference in each quadrant around (`x`, `y`) of cell `k`; tell if unproven cells were seen."""
-    row, col = k // width, k % width
-    fx = x - col * cell
-    fy = y - row * cell
-    best0 = best1 = best2 = best3 = np.int64(1) << 60
-    found[0] = found[1] = found[2] = found[3] = -1
+    """Find the nearest reference in each quadrant around (`x`, `y`) of cell `k`; tell if unproven cells were seen.
+
+    `found` (int64, 9) gets the four cells or -1, the last ring visited, and the squared distances. The quadrants are
+    half-open, so that a point on an axis belongs to one of them, and numbered right + 2 up: no branch decides.
+    """
+    fx = x - k % width * cell
+    fy = y - k // width * cell
+    for q in range(4):
+        found[q] = -1
+        found[5 + q] = np.int64(1) << 60
     seen = np.uint8(0)
     for ring in range(rings + 1):
+        found[4] = ring
         for dr in range(-ring, ring + 1):
             base = k + dr * width
             step = 1 if abs(dr) == ring or ring == 0 else 2 * ring
             for j in range(base - ring, base + ring + 1, step):
                 s = state[j]
-                if not s & (REF | UNPROVEN):
-                    continue
                 seen |= s
                 if not s & REF:
                     continue
                 dx = np.int64(pos[j, 0]) - x
                 dy = np.int64(pos[j, 1]) - y
                 d2 = dx * dx + dy * dy
-                if d2 > limit2:
+                right = (dx > 0) | ((dx == 0) & (dy < 0))
+                up = (dy > 0) | ((dy == 0) & (dx > 0))
+                q = np.int64(right) + 2 * np.int64(up)
+                if d2 > found[5 + q] or d2 > limit2 or d2 == 0:
                     continue
-                if dx > 0 and dy >= 0:
-                    if d2 < best0 or (d2 == best0 and before(pos, j, found[0])):
-                        best0 = d2
-                        found[0] = j
-                elif dx <= 0 and dy > 0:
-                    if d2 < best1 or (d2 == best1 and before(pos, j, found[1])):
-                        best1 = d2
-                        found[1] = j
-                elif dx < 0:
-                    if d2 < best2 or (d2 == best2 and before(pos, j, found[2])):
-                        best2 = d2
-                        found[2] = j
-                elif dy < 0 and (d2 < best3 or (d2 == best3 and before(pos, j, found[3]))):
-                    best3 = d2
-                    found[3] = j
-        right = (ring + 1) * cell - fx
-        left = ring * cell + fx
+                if d2 < found[5 + q] or before(pos, j, found[q]):
+                    found[5 + q] = d2
+                    found[q] = j
+        right_side = (ring + 1) * cell - fx
+        left_side = ring * cell + fx
         top = (ring + 1) * cell - fy
         bottom = ring * cell + fy
-        b = min(right, top)
-        if best0 >= b * b:
-            continue
-        b = min(left, top)
-        if best1 >= b * b:
-            continue
-        b = min(left, bottom)
-        if best2 >= b * b:
-            continue
-        b = min(right, bottom)
-        if best3 >= b * b:
-            continue
-        break
+        if (
+            found[8] < min(right_side, top) ** 2
+            and found[7] < min(left_side, top) ** 2
+            and found[5] < min(left_side, bottom) ** 2
+            and found[6] < min(right_side, bottom) ** 2
+        ):
+            break
     return (seen & UNPROVEN) != 0
 
 
