@@ -62,10 +62,10 @@ class Answer:
         Core points of each source.
     ground, unproven : ndarray of bool, shape (n,)
         The mask, and what could not be proven.
-    tries : int
-        Clouds classified.
-    loaded, loaded_most : int
-        Points of all these clouds, and of the largest.
+    loaded : tuple of int
+        Points of each cloud that was classified.
+    loaded_first : int
+        Points of those with the first guess of the buffer.
     width : int
         The widest buffer tried, mm.
     full : bool
@@ -76,11 +76,15 @@ class Answer:
     counts: dict[str, int]
     ground: npt.NDArray[np.bool_]
     unproven: npt.NDArray[np.bool_]
-    tries: int
-    loaded: int
-    loaded_most: int
+    loaded: tuple[int, ...]
+    loaded_first: int
     width: int
     full: bool
+
+    @property
+    def tries(self) -> int:
+        """Clouds classified."""
+        return len(self.loaded)
 
 
 def solve(store: RunStore, job: ClassifyJob) -> Answer:
@@ -107,7 +111,7 @@ def solve(store: RunStore, job: ClassifyJob) -> Answer:
     ground, unproven = np.zeros(near.n, np.bool_), np.ones(near.n, np.bool_)
     reach = 0 if chosen.exact else round(chosen.required_buffer(job.filter) * 1000)
     lost = unsure(job.cut, job.chunk, near, reach)
-    todo, loads, widest, full = [(job.chunk.core, job.buffer)], [0], job.buffer, False
+    todo, loaded, first, widest, full = [(job.chunk.core, job.buffer)], [], 0, job.buffer, False
     while todo:
         part, width = todo.pop()
         if near.expect(part, width) > job.most_points:
@@ -118,7 +122,8 @@ def solve(store: RunStore, job: ClassifyJob) -> Answer:
                 continue
         cloud, index = near.cloud(part, width)
         widest = max(widest, width)
-        loads.append(cloud.n)
+        loaded.append(cloud.n)
+        first += cloud.n if width == job.buffer else 0
         verdict = chosen.classify(cloud, job.filter)
         # What an earlier cloud proved stays: this one may see less on the far side.
         index, seen = index[unproven[index]], unproven[index]
@@ -134,7 +139,7 @@ def solve(store: RunStore, job: ClassifyJob) -> Answer:
         todo += [(place, wider) for place in cover(x[left], y[left], wider)]
     if len(near.core) > 3:
         ground |= near.core[3].astype(np.bool_)
-    return Answer(near.core, near.counts, ground, unproven | lost, len(loads) - 1, sum(loads), max(loads), widest, full)
+    return Answer(near.core, near.counts, ground, unproven | lost, tuple(loaded), first, widest, full)
 
 
 def quarters(part: Rect, width: int) -> list[Rect]:

@@ -166,7 +166,7 @@ class Cutting:
         p = self.inputs.plan
         return Cut(p.grid, p.stored_buffer, self.extent, self.unknown)
 
-    @property
+    @cached_property
     def widest(self) -> int:
         """The widest buffer a chunk may try, mm."""
         p = self.inputs.plan

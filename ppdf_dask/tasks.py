@@ -105,8 +105,9 @@ def classify(url: str, job: ClassifyJob, fingerprint: str) -> dict[str, Any]:
     record = {
         "status": "done" if n else "empty",
         "points": n,
-        "loaded": found.loaded,
-        "loaded_most": found.loaded_most,
+        "loaded": sum(found.loaded),
+        "loaded_first": found.loaded_first,
+        "loaded_most": max(found.loaded),
         "ground": int(found.ground.sum()),
         "unproven": int(found.unproven.sum()),
         "buffer_m": found.width / 1000,

@@ -7,12 +7,23 @@ from typing import Any
 
 import click
 
-from ppdf_dask.cli.show import chosen, chosen_filter, json_option, score_option, show, ticking, tracked
+from ppdf_dask.cli.scale import scale
+from ppdf_dask.cli.show import (
+    chosen,
+    chosen_filter,
+    json_option,
+    plot_option,
+    save,
+    score_option,
+    show,
+    ticking,
+    tracked,
+)
 
 
 @click.group()
 def benchmark() -> None:
-    """Measure accuracy on labelled clouds, and speed."""
+    """Measure accuracy on labelled clouds, speed, and runtime against density."""
 
 
 @benchmark.command()
@@ -77,3 +88,49 @@ def speed(
             found = tuple(study.measure(path, choices, repeat=repeat, memory=memory, tick=tick) for path in paths)
     compiled = {c.name: study.compilation(c) for c in tracked(choices, "compile")} if compilation else {}
     show(study.SpeedTable(found, compiled), as_json=as_json)
+
+
+benchmark.add_command(scale)
+
+
+@benchmark.command("density")
+@click.argument("cloud", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "--filter",
+    "names",
+    multiple=True,
+    default=("ppdf:robust", "ppdf:paper"),
+    show_default=True,
+    metavar="NAME[:PROFILE]",
+    help="What to time; may be repeated.",
+)
+@click.option(
+    "--steps", type=click.IntRange(1, 20), default=7, show_default=True, help="Densities, each half the last."
+)
+@click.option("--repeat", type=click.IntRange(1), default=3, show_default=True, help="Rounds; medians are reported.")
+@json_option
+@plot_option
+def runtime(
+    cloud: Path | None, names: tuple[str, ...], steps: int, repeat: int, as_json: bool, plot: Path | None
+) -> None:
+    """Time filters on a cloud that is thinned in steps; without CLOUD the densest synthetic site.
+
+    \b
+    ppdf-dask benchmark density --plot density
+    ppdf-dask benchmark density tile.laz --filter ppdf --filter smrf --json
+    """
+    from ppdf_dask.experiments import thinning as study
+    from ppdf_dask.experiments.labelled import read, site
+    from ppdf_dask.experiments.speed import Choice
+    from ppdf_dask.experiments.variants import Variant
+    from ppdf_dask.synthetic import six_sites
+
+    variants = [Variant(choice.name, choice.params) for name in names for choice in Choice.of(name)]
+    with ticking((repeat + 1) * len(variants) * steps, "time") as tick:
+        labelled = site(six_sites()[0]) if cloud is None else read(cloud)
+        found = study.runtimes(labelled, variants, halvings=steps, repeat=repeat, tick=tick)
+    if plot is not None:
+        made = study.figure(found).get_figure(root=True)
+        assert made is not None
+        save(made, plot)
+    show(found, as_json=as_json)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 
 import numpy.typing as npt
 
@@ -51,9 +52,15 @@ class Filter:
     bytes_per_point: float
 
 
+@cache
+def _entries() -> tuple[EntryPoint, ...]:
+    """Return the entry points; finding them reads the metadata of all installed packages."""
+    return tuple(entry_points(group=GROUP))
+
+
 def names() -> list[str]:
     """Return the names of all installed filters."""
-    return sorted({e.name for e in entry_points(group=GROUP)})
+    return sorted({e.name for e in _entries()})
 
 
 def get(name: str) -> Filter:
@@ -64,7 +71,7 @@ def get(name: str) -> Filter:
     ParameterError
         When no installed package offers it.
     """
-    for entry in entry_points(group=GROUP):
+    for entry in _entries():
         if entry.name == name:
             found = entry.load()
             if not isinstance(found, Filter):
