@@ -217,7 +217,7 @@ def _check_key() -> None:
     """Refuse a private key that others can read."""
     import dask
 
-    key = dask.config.get("distributed.comm.tls.client.key")
+    key = dask.config.get("distributed.comm.tls.client.key", default=None)
     if not key:
         raise ClusterError(
             "a tls:// scheduler needs this side's certificates: set DASK_DISTRIBUTED__COMM__TLS__CA_FILE, "
