@@ -88,7 +88,7 @@ class Surroundings:
         self._store, self._cut, self._chunk = store, cut, chunk
         cores = fragments(store, chunk.id, "core")
         self.counts = {source: points.shape[1] for source, points in cores.items()}
-        self.core: Int32 = _join(list(cores.values()))
+        self.core: Int32 = join(list(cores.values()))
         self._parts: dict[str, Parts] = {}
         self._kept: dict[str, Int32] = {}
 
@@ -107,8 +107,8 @@ class Surroundings:
         if part == self._chunk.core and width <= self._cut.buffer:
             return float(sum(n for side in self._index(self._chunk.id).values() for n, _ in side.values()))
         known, points = part.grow(width), 0.0
-        for other in self._cut.grid.over(_overlap(known, self._cut.extent)):
-            shared = _overlap(known, other.core)
+        for other in self._cut.grid.over(overlap(known, self._cut.extent)):
+            shared = overlap(known, other.core)
             inside = sum(n for n, _ in self._index(other.id).get("core", {}).values())
             points += inside * (shared.width * shared.height) / (other.core.width * other.core.height)
         return points
@@ -144,12 +144,12 @@ class Surroundings:
         if home.grow(stored).contains(known):
             whole = known == home.grow(stored)
             around = fragments(self._store, self._chunk.id, "buffer").values()
-            pieces += [p if whole else _crop(p, home, home, known) for p in around]
+            pieces += [p if whole else crop(p, home, home, known) for p in around]
         else:
-            for other in self._cut.grid.over(_overlap(known, self._cut.extent)):
+            for other in self._cut.grid.over(overlap(known, self._cut.extent)):
                 if other != self._chunk:
-                    pieces.append(_crop(self._neighbour(other), other.core, home, known))
-        points = _join([p for p in pieces if p.shape[1]])
+                    pieces.append(crop(self._neighbour(other), other.core, home, known))
+        points = join([p for p in pieces if p.shape[1]])
         cloud = Cloud(
             x=points[0],
             y=points[1],
@@ -168,7 +168,7 @@ class Surroundings:
 
     def _neighbour(self, chunk: Chunk) -> Int32:
         if chunk.id not in self._kept:
-            found = _join(list(fragments(self._store, chunk.id, "core").values()))
+            found = join(list(fragments(self._store, chunk.id, "core").values()))
             while self._kept and sum(p.shape[1] for p in self._kept.values()) + found.shape[1] > KEPT_POINTS:
                 self._kept.pop(next(iter(self._kept)))
             self._kept[chunk.id] = found
@@ -209,17 +209,19 @@ def inside(points: Int32, home: Rect, place: Rect) -> Bools:
     return found
 
 
-def _overlap(a: Rect, b: Rect) -> Rect:
+def overlap(a: Rect, b: Rect) -> Rect:
+    """Return what two rectangles share; of a width or height below 0 when that is nothing."""
     return Rect(max(a.x0, b.x0), max(a.y0, b.y0), min(a.x1, b.x1), min(a.y1, b.y1))
 
 
-def _join(pieces: list[Int32]) -> Int32:
+def join(pieces: list[Int32]) -> Int32:
+    """Join points, int32 (3 or 4, n)."""
     if not pieces:
         return np.empty((3, 0), np.int32)
     return pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=1)
 
 
-def _crop(points: Int32, home: Rect, target: Rect, known: Rect) -> Int32:
+def crop(points: Int32, home: Rect, target: Rect, known: Rect) -> Int32:
     """Keep what lies in `known`, shifted from its own chunk's corner to that of `target`."""
     kept = points[:, inside(points, home, known)]
     kept[0] += home.x0 - target.x0

@@ -5,11 +5,10 @@ from __future__ import annotations
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import click
 
-from ppdf_dask.cli.show import json_option, show, ticking
+from ppdf_dask.cli.show import json_option, plot_option, save, show, ticking
 
 
 def numbers(ctx: click.Context, param: click.Parameter, value: str) -> list[float]:
@@ -53,3 +52,24 @@ def scale(points: list[float], workers: list[float], simulate: int | None, keep:
             sizes = [p * 1e6 for p in points]
             found = study(sizes, [int(w) for w in workers], Path(folder), RunParams(), tick)
         show(found, as_json=as_json)
+
+
+@click.command()
+@click.argument("run", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="RUN")
+@json_option
+@plot_option
+def seams(run: Path, as_json: bool, plot: Path | None) -> None:
+    """Measure how far neighbouring chunks disagree where both have an answer: 0 for ppdf, by proof.
+
+    \b
+    ppdf-dask seams RUN
+    ppdf-dask seams RUN --plot seams
+    """
+    from ppdf_dask.result import Result
+    from ppdf_dask.seams import measure
+
+    with ticking(Result(run).counts["chunks"], "seams") as tick:
+        found = measure(run, tick)
+    show(found, as_json=as_json)
+    if plot is not None:
+        save(found.figure(), plot)
