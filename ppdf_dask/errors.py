@@ -44,11 +44,13 @@ class DamagedError(StoreError):
     ----------
     path : str
         The object's path in the store; it tells which work has to be done again.
+    kind : str
+        ``"missing"``, ``"torn"``, ``"flipped"`` or ``"foreign"``.
     """
 
-    def __init__(self, message: str, path: str = "") -> None:
-        super().__init__(message, path)
-        self.path = path
+    def __init__(self, message: str, path: str = "", kind: str = "torn") -> None:
+        super().__init__(message, path, kind)
+        self.path, self.kind = path, kind
 
     def __str__(self) -> str:
         return str(self.args[0])

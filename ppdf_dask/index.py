@@ -75,12 +75,15 @@ class Index:
         for chunk in store.children("ledger/index"):
             if chunk != "key" and chunk not in self.chunks:
                 store.drop_record("index", chunk)
-        for path in self.orphans(store):
+        for path in list(self.orphans(store)):
             store.drop(path)
         store.put_record("index", "key", {"digest": key})
 
     def orphans(self, store: RunStore) -> Iterator[str]:
-        """Yield the paths of fragments that no finished tile claims."""
+        """Yield the paths of fragments that no finished tile claims, and of results of chunks that are no more."""
+        owners = self.points
+        for group in ("classification", "ground"):
+            yield from (f"{group}/{chunk}" for chunk in store.children(group) if chunk not in owners)
         for chunk in store.chunks():
             if chunk not in self.chunks:
                 yield f"chunks/{chunk}"

@@ -139,17 +139,39 @@ def plain_header(header: laspy.LasHeader) -> laspy.LasHeader:
     return header
 
 
+def class_counts(path: Path) -> dict[str, Any]:
+    """Count points and classes of a written file again: ``points``, ``classes``, ``crc32`` as in its record.
+
+    Raises
+    ------
+    TileError
+        When it cannot be decoded.
+    """
+    try:
+        return _count(path).record()
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    # The decompressor may panic on a broken stream, which is not an Exception.
+    except BaseException as error:
+        raise TileError(f"{shown(str(path))} cannot be decoded: {error}") from None
+
+
 def _verify(part: Path, meant: _Histogram) -> None:
-    found = _Histogram()
-    only = laspy.DecompressionSelection.base() | laspy.DecompressionSelection.CLASSIFICATION
-    with laspy.open(part, laz_backend=laspy.LazBackend.Lazrs, decompression_selection=only) as reader:
-        for points in reader.chunk_iterator(BATCH):
-            found.add(np.asarray(points.classification, np.uint8))
+    found = _count(part)
     if (found.points, found.crc) != (meant.points, meant.crc):
         raise TileError(
             f"{part} does not read back as written ({found.points} of {meant.points} points); "
             "check the disk and run again"
         )
+
+
+def _count(path: Path) -> _Histogram:
+    found = _Histogram()
+    only = laspy.DecompressionSelection.base() | laspy.DecompressionSelection.CLASSIFICATION
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, decompression_selection=only) as reader:
+        for points in reader.chunk_iterator(BATCH):
+            found.add(np.asarray(points.classification, np.uint8))
+    return found
 
 
 class _Masks:

@@ -96,12 +96,13 @@ class ObjectStore:
         except (ValueError, KeyError, TypeError):
             raise self.damage(path, "has torn metadata") from None
 
-    def damage(self, path: str, what: str) -> DamagedError:
+    def damage(self, path: str, what: str, kind: str = "torn") -> DamagedError:
         """Return the error that says what is wrong with an object and what helps."""
         return DamagedError(
             f"{path or 'the root'} in {self.url} {what}; `ppdf-dask verify` lists all that is damaged, "
             "`ppdf-dask run` redoes it",
             path,
+            kind,
         )
 
 

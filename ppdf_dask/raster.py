@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -75,8 +76,9 @@ def jobs(raster: Raster, ground: dict[Rect, int], params: DtmParams) -> Iterator
         yield block, max(1, round(n))
 
 
-def rasterize(store: RunStore, job: RasterJob) -> dict[str, Any]:
-    """Compute one block and write its shards."""
+def rasterize(store: RunStore, job: RasterJob, into: RunStore | None = None) -> dict[str, Any]:
+    """Compute one block and write its shards, into another store if one is given (`debug`)."""
+    into = into or store
 
     def load(rect: Rect) -> npt.NDArray[np.int64]:
         parts = [np.empty((0, 3), np.int64)]
@@ -91,17 +93,27 @@ def rasterize(store: RunStore, job: RasterJob) -> dict[str, Any]:
 
     found = rasterize_block(job.block, load, job.params, extent=job.cut.extent, unit_z=job.unit_z)
     row, column = job.block.row - job.raster.row, job.block.col - job.raster.col
-    store.write_block("height", row, column, found.height)
-    store.write_block("distance", row, column, found.distance)
+    into.write_block("height", row, column, found.height)
+    into.write_block("distance", row, column, found.distance)
     if found.filled is not None:
-        store.write_block("filled", row, column, found.filled)
+        into.write_block("filled", row, column, found.filled)
     known = ~np.isnan(found.height)
+    layers = [v for v in (found.height, found.distance, found.filled) if v is not None]
     return {
         "status": "done" if known.any() else "empty",
         "pixels": int(known.sum()),
+        "crc32": checksum(layers),
         "ground_read": found.points,
         "margin_m": found.margin / MM,
     }
+
+
+def checksum(layers: list[npt.NDArray[np.float32]]) -> int:
+    """Return a checksum of a block's layers in which all NaN are alike."""
+    found = 0
+    for values in layers:
+        found = zlib.crc32(np.where(np.isnan(values), np.float32("nan"), values).tobytes(), found)
+    return found
 
 
 def _clip(a: Rect, b: Rect) -> Rect:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from contextlib import suppress
 from pathlib import Path
 
 from ppdf_dask.errors import StoreError
-from ppdf_dask.objects import LEFTOVER
 from ppdf_dask.quarantine import write_json
 from ppdf_dask.store import RunStore
 
@@ -58,25 +56,38 @@ def heal(store: RunStore, path: str) -> None:
         store.drop(path)
 
 
-def note(out: Path, paths: list[str]) -> None:
-    """Leave a note for the next run of what is damaged; none when nothing is."""
-    if paths:
-        write_json(out / NOTES, sorted(paths))
+def note(out: Path, redo: list[str], remove: list[str]) -> None:
+    """Leave a note for the next run of what is to be made anew, and of what is to be removed.
+
+    Parameters
+    ----------
+    out : Path
+        The run's folder.
+    redo, remove : list of str
+        Paths in the store; without any, an older note goes.
+    """
+    if redo or remove:
+        write_json(out / NOTES, {"redo": sorted(redo), "remove": sorted(remove)})
     else:
         (out / NOTES).unlink(missing_ok=True)
 
 
 def take_notes(out: Path, store: RunStore) -> None:
-    """Do what a note asks for, then remove it."""
+    """Do what a note asks for, then remove it; to be called under the lock."""
     path = out / NOTES
     if not path.is_file():
         return
-    with suppress(ValueError):
-        for damaged in json.loads(path.read_text(encoding="utf-8")):
-            if str(damaged).endswith(LEFTOVER):
-                store.delete(str(damaged))
-            else:
-                heal(store, str(damaged))
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        redo, remove = [str(p) for p in found["redo"]], [str(p) for p in found["remove"]]
+    except (ValueError, KeyError, TypeError):
+        redo, remove = [], []
+    for damaged in redo:
+        heal(store, damaged)
+    for orphan in remove:
+        if ".." not in orphan.split("/") and not orphan.startswith("/"):
+            store.delete(orphan)
+            store.drop(orphan)
     path.unlink()
 
 

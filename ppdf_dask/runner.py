@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ppdf_dask import __version__, tasks
-from ppdf_dask.errors import PartialRunError, PlanError, SurveyError
+from ppdf_dask.errors import DamagedError, PartialRunError, PlanError, SurveyError
 from ppdf_dask.events import Event, Listener, ignore
 from ppdf_dask.execute import Stage, Work, execute, nothing
 from ppdf_dask.filters.cloud import Density
@@ -126,11 +126,14 @@ class _Run:
     def go(self) -> bool:
         """Go through all stages; tell whether no damage was found."""
         self.waiting, self.damaged = [], []
-        self.tile()
-        if self.tiles or not self.failures:
-            self.classify()
-            self.merge()
-            self.rasterize()
+        try:
+            self.tile()
+            if self.tiles or not self.failures:
+                self.classify()
+                self.merge()
+                self.rasterize()
+        except DamagedError as error:
+            self.damaged.append(error.path)
         for path in self.damaged:
             heal(self.store, path)
         return not self.damaged
@@ -179,6 +182,8 @@ class _Run:
         failed = [Waiting("dtm", w.ident, "it failed") for w in works if w.ident not in self.blocks]
         done = [w for w in works if w.ident in self.blocks]
         self.waiting += waiting
+        if self.damaged:
+            return
         export = self.cutting.cog_work(done, waiting + failed)
         exported = self._stage("cog", tasks.export, [export], lambda name, record: _same_size(p.out / name, record))
         for name in {"dtm.tif", "dtm.partial.tif"} - exported.keys():

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -139,7 +138,7 @@ class RunStore(ObjectStore):
         path = f"chunks/{chunk}/{part}/{source}"
         points: npt.NDArray[np.int32] = self._read(path, expected[1] if expected else None)
         if expected and points.shape[1] != expected[0]:
-            raise self.damage(path, f"holds {points.shape[1]} points, the ledger says {expected[0]}")
+            raise self.damage(path, f"holds {points.shape[1]} points, the ledger says {expected[0]}", "foreign")
         return points
 
     def fragment_attributes(self, chunk: str, part: str, source: str) -> dict[str, Any]:
@@ -147,7 +146,7 @@ class RunStore(ObjectStore):
         path = f"chunks/{chunk}/{part}/{source}"
         found = self.get_node(path)
         if found is None or found.get("path") != path:
-            raise self.damage(path, "is missing" if found is None else f"is really {found.get('path')}")
+            raise self._absent(path, found)
         return found
 
     def sources(self, chunk: str, part: str) -> list[str]:
@@ -157,10 +156,6 @@ class RunStore(ObjectStore):
     def chunks(self) -> list[str]:
         """Return the sorted ids of all chunks with fragments."""
         return self.children("chunks")
-
-    def drop_points(self) -> None:
-        """Remove all fragments: they are only needed until the run is complete."""
-        self.drop("chunks")
 
     # -- results --------------------------------------------------------------------------------------------------
 
@@ -180,7 +175,7 @@ class RunStore(ObjectStore):
         path = f"classification/{chunk}"
         attributes = self.get_node(path)
         if attributes is None:
-            raise self.damage(path, "is missing")
+            raise self.damage(path, "is missing", "missing")
         values = self._read(path, made_by)
         if (values > 1).any() or sum(attributes["counts"]) != len(values):
             raise self.damage(path, "is incomplete")
@@ -246,9 +241,21 @@ class RunStore(ObjectStore):
         array[...] = values
         self.put(key, objects[f"dtm/{name}/c/0/0"].to_bytes())
 
-    def raster(self, name: str) -> Any:
-        """Return the Zarr array of a raster for reading."""
-        return self._array(f"dtm/{name}")
+    def read_block(self, name: str, row: int, column: int, size: int) -> npt.NDArray[np.float32]:
+        """Read one whole shard of a raster; NaN where none was written.
+
+        Raises
+        ------
+        DamagedError
+            When the shard or the raster's metadata is damaged.
+        """
+        array = self._array(f"dtm/{name}")
+        try:
+            found: npt.NDArray[np.float32] = array[row * size : (row + 1) * size, column * size : (column + 1) * size]
+        except (ValueError, RuntimeError, IndexError) as error:
+            key = f"dtm/{name}/c/{row}/{column}"
+            raise self.damage(key, f"is damaged ({error})", "flipped") from error
+        return found
 
     # -- ledger ---------------------------------------------------------------------------------------------------
 
@@ -303,22 +310,22 @@ class RunStore(ObjectStore):
         try:
             return zarr.open_array(self._store, path=path, mode="r", zarr_format=3)
         except FileNotFoundError:
-            raise self.damage(path, "is missing") from None
+            raise self.damage(path, "is missing", "missing") from None
         except (ValueError, TypeError, KeyError) as error:
             raise self.damage(path, f"has torn metadata ({error})") from error
 
     def _read(self, path: str, made_by: str | None = None) -> Any:
         array = self._array(path)
         if array.attrs.get("path") != path:
-            raise self.damage(path, f"is really {array.attrs.get('path')}")
+            raise self._absent(path, array.attrs)
         if made_by is not None and array.attrs.get("made_by") != made_by:
-            raise self.damage(path, "is of another run or of other settings")
+            raise self.damage(path, "is of another run or of other settings", "foreign")
         if array.nchunks_initialized != array.nchunks:
-            raise self.damage(path, "has lost data")
+            raise self.damage(path, "has lost data", "missing")
         try:
             return array[...]
         except (ValueError, RuntimeError) as error:
-            raise self.damage(path, f"is damaged ({error})") from error
+            raise self.damage(path, f"is damaged ({error})", "flipped") from error
 
     def _write(
         self,
@@ -351,6 +358,11 @@ class RunStore(ObjectStore):
             array[...] = values
         self._put_array(path, objects)
 
+    def _absent(self, path: str, found: Any) -> DamagedError:
+        if found is None:
+            return self.damage(path, "is missing", "missing")
+        return self.damage(path, f"is really {found.get('path')}", "foreign")
+
     def _identity(self, path: str) -> dict[str, Any]:
         return {"path": path, "made_by": self.made_by}
 
@@ -377,8 +389,3 @@ def _raster(path: str, shape: tuple[int, ...], block: int, attributes: dict[str,
         attributes=attributes,
     )
     return objects, array
-
-
-def store_of(run: str | Path) -> RunStore:
-    """Return the store of a run's folder."""
-    return RunStore(str(Path(run) / "run.zarr"))

@@ -37,3 +37,25 @@ def client() -> Iterator[Client]:
         Client(cluster) as made,
     ):
         yield made
+
+
+@pytest.fixture(scope="session")
+def tiles(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write two tiles of 40 m that share a chunk, five thousand points; return their folder."""
+    folder = tmp_path_factory.mktemp("tiny")
+    params = SyntheticParams(density=1.0, low_noise=0.001)
+    write_survey(folder, params, extent=(600, 600, 680, 640), tile_size=40, truth=False)
+    return folder / "tiles"
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tiles: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run the survey of `tiles` as the fault tests do, with nothing in its way; ``puts.txt`` counts its writes."""
+    from faulty import Inline, at_put, finished, killed, small_plan
+
+    out, client = tmp_path_factory.mktemp("undisturbed"), Inline()
+    with at_put(-1, killed) as keys:
+        small_plan(tiles, out).run(client)
+    assert finished(out) == set(client.ran)
+    (out / "puts.txt").write_text(str(len(keys)))
+    return out

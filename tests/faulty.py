@@ -89,7 +89,7 @@ def outputs(out: Path) -> dict[str, int]:
     return {
         str(p.relative_to(out)): zlib.crc32(p.read_bytes())
         for p in sorted(out.rglob("*"))
-        if p.is_file() and "run.zarr" not in p.parts and p.name != "run.json"
+        if p.is_file() and "run.zarr" not in p.parts and p.name not in ("run.json", "puts.txt")
     }
 
 
@@ -161,3 +161,8 @@ def in_child(call: Callable[[], Any]) -> int:
             os._exit(status)
     _, raw = os.waitpid(child, 0)
     return os.waitstatus_to_exitcode(raw)
+
+
+def same(out: Path, undisturbed: Path) -> bool:
+    """Tell whether two runs left the same bytes, for their user and in their stores."""
+    return outputs(out) == outputs(undisturbed) and arrays(out) == arrays(undisturbed)

@@ -80,7 +80,10 @@ def plan(tiles: tuple[str, ...], as_json: bool, **options: Any) -> None:
 @_cluster
 @click.option("--overwrite", is_flag=True, help="Start anew where a run exists.")
 @click.option("--accept-changes", is_flag=True, help="Go on with changed inputs or parameters; redo what they touch.")
-def run(tiles: tuple[str, ...], out: Path, overwrite: bool, accept_changes: bool, **options: Any) -> None:
+@click.option("--force-unlock", is_flag=True, help="Take the folder's lock from a run that is surely gone.")
+def run(
+    tiles: tuple[str, ...], out: Path, overwrite: bool, accept_changes: bool, force_unlock: bool, **options: Any
+) -> None:
     """Classify a survey: tiles in, classified tiles and a terrain model out. Run it again to resume.
 
     \b
@@ -97,7 +100,7 @@ def run(tiles: tuple[str, ...], out: Path, overwrite: bool, accept_changes: bool
     made.check()
     if not cluster["quiet"]:
         click.echo(repr(made), err=True)
-    result = _run(made, cluster, overwrite=overwrite, accept_changes=accept_changes)
+    result = _run(made, cluster, overwrite=overwrite, accept_changes=accept_changes, force_unlock=force_unlock)
     if not cluster["quiet"]:
         click.echo(repr(result))
 
@@ -183,7 +186,7 @@ def _memory(cluster: dict[str, Any]) -> float:
         return worker_memory(client)
 
 
-def _run(made: Plan, cluster: dict[str, Any], *, overwrite: bool, accept_changes: bool) -> Result:
+def _run(made: Plan, cluster: dict[str, Any], **how: bool) -> Result:
     from rich.console import Console
 
     from ppdf_dask import preflight
@@ -196,4 +199,4 @@ def _run(made: Plan, cluster: dict[str, Any], *, overwrite: bool, accept_changes
             for line in dashboard(client):
                 console.print(line, highlight=False, markup=False)
         preflight.check(client, made)
-        return made.run(client, on_event=listener, overwrite=overwrite, accept_changes=accept_changes)
+        return made.run(client, on_event=listener, **how)
