@@ -115,25 +115,24 @@ def cases(names: Sequence[str], profiles: Sequence[str] = ("default", "paper")) 
     Raises
     ------
     ParameterError
-        When a filter is unknown, or no filter has a profile.
+        When a filter is unknown, or a profile that no installed filter has.
 
     Examples
     --------
     >>> [case.name for case in cases(["ppdf", "smrf"])]
     ['ppdf robust', 'ppdf paper', 'smrf default']
     """
+    everywhere = {p for name in filters.names() for p in filters.get(name).profiles} | {"default", "all"}
+    unknown = sorted(set(profiles) - everywhere)
+    if unknown:
+        raise ParameterError(f"no filter has a profile {', '.join(unknown)}; there are {', '.join(sorted(everywhere))}")
     found: dict[str, Case] = {}
-    met = set()
     for name in dict.fromkeys(n for asked in names for n in (filters.names() if asked == "all" else [asked])):
         known = filters.get(name).profiles
         wanted = [next(iter(known)) if p == "default" else p for p in profiles]
         for profile in known if "all" in profiles else wanted:
             if profile in known:
                 found.setdefault(f"{name} {profile}", Case(name, profile, known[profile]))
-                met.add(profile)
-    missing = sorted(set(profiles) - met - {"default", "all"})
-    if missing:
-        raise ParameterError(f"none of the filters {', '.join(names)} has a profile {', '.join(missing)}")
     return list(found.values())
 
 

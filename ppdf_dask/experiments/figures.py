@@ -96,6 +96,7 @@ def terrain_figure(found: Comparison, out: str | Path, site: str) -> Figure:
         draw_hillshade(height, extent, (extent[1] - extent[0]) / height.shape[1], axes)
         axes.images[0].set_clim(low, high)
         axes.images[1].set_alpha(SHADE)
+        axes.axis(extent)
         axes.set_title(name, fontsize="medium")
     figure.colorbar(panels[0].images[0], ax=legend, label="height, m", shrink=0.7)
     figure.suptitle(_title(site, rect, "terrain models of 1 m"))
@@ -182,6 +183,7 @@ def site_figure(sites: Sequence[dict[str, Any]], out: str | Path, layer: str) ->
 def _bars(found: Comparison, columns: Sequence[tuple[str, Callable[[Row], float]]], *, log: bool = False) -> Figure:
     """Draw a panel per column: each site's value, mean and deviation; the mean alone on a logarithmic axis."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     cases, names = found.cases, [s["site"] for s in found.sites]
     size = (2.0 + (4.0 if log else 2.6) * len(columns), 1.4 + 0.32 * len(cases))
@@ -196,6 +198,7 @@ def _bars(found: Comparison, columns: Sequence[tuple[str, Callable[[Row], float]
         axes.spines[["top", "right"]].set_visible(False)
         if log:
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_formatter("")
     panels[0].set_yticks(range(len(cases)), cases)

@@ -38,7 +38,7 @@ def write_raster(path: Path, values: npt.NDArray[np.float32], rect: Rect, pixel:
         dtype="float32",
         nodata=float("nan"),
         compress="deflate",
-        transform=rasterio.transform.from_origin(rect.x0 / MM, rect.y1 / MM, pixel / MM, pixel / MM),
+        transform=rasterio.Affine(pixel / MM, 0.0, rect.x0 / MM, 0.0, -pixel / MM, rect.y1 / MM),
     ) as target:
         target.write(values, 1)
     part.replace(path)

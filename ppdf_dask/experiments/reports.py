@@ -33,7 +33,7 @@ SIX = (
 )
 """What a study of the synthetic sites must say."""
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
+_FORMULA = ("=", "+", "-", "@")
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,8 @@ class Report:
             "Mean ± sample standard deviation (n - 1), each site with the same weight. Each filter sees the returns it "
             "asks for by default; points it does not see count as not ground. RMSE: the 1 m terrain model less that of "
             "the reference's ground, where both know a height; missing: pixels where only the reference does. Times: "
-            "processor time of the filter alone, one thread, after a first run on a few points; Mpts/s counts the points"
-            " it saw."
+            "processor time of the filter alone, one thread, after a first run on a few points; Mpts/s counts the "
+            "points it saw."
         )
         return [markdown(head, lines), note]
 
@@ -216,8 +216,9 @@ def csv_text(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     head : sequence of str
         Names of the columns.
     rows : iterable of sequence
-        Texts and numbers. A text that begins with ``= + - @``, a tab or a line break gets an apostrophe before it, as
-        OWASP advises ("CSV injection"); names of files may come from anywhere.
+        Texts and numbers. A text that begins with ``= + - @`` gets an apostrophe before it, as OWASP advises ("CSV
+        injection"), and what does not print, such as tabs and line breaks, becomes a space: names of files may come
+        from anywhere.
 
     Examples
     --------
@@ -233,7 +234,8 @@ def csv_text(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 def _cell(value: Any) -> Any:
     if isinstance(value, str):
-        return f"'{value}" if value.startswith(_FORMULA) else value
+        value = _printable(value)
+        return f"'{value}" if value.lstrip().startswith(_FORMULA) else value
     return "" if isinstance(value, float) and math.isnan(value) else value
 
 
@@ -271,4 +273,8 @@ def _both(rate: MeanStd, scale: float, digits: int) -> str:
 
 def _safe(name: str) -> str:
     """Keep a name from ending a table's cell or line."""
-    return "".join(c if c.isprintable() else " " for c in name).replace("|", "\\|")
+    return _printable(name).replace("|", "\\|")
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in text)
