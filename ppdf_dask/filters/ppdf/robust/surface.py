@@ -40,12 +40,12 @@ def nearest(
                 d2 = dx * dx + dy * dy
                 right = (dx > 0) | ((dx == 0) & (dy < 0))
                 up = (dy > 0) | ((dy == 0) & (dx > 0))
-                q = np.int64(right) + 2 * np.int64(up)
-                if d2 > found[5 + q] or d2 > limit2 or d2 == 0:
+                quadrant = np.int64(right) + 2 * np.int64(up)
+                if d2 > found[5 + quadrant] or d2 > limit2 or d2 == 0:
                     continue
-                if d2 < found[5 + q] or before(pos, j, found[q]):
-                    found[5 + q] = d2
-                    found[q] = j
+                if d2 < found[5 + quadrant] or before(pos, j, found[quadrant]):
+                    found[5 + quadrant] = d2
+                    found[quadrant] = j
         right_side = (ring + 1) * cell - fx
         left_side = ring * cell + fx
         top = (ring + 1) * cell - fy
