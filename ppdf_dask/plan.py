@@ -45,7 +45,7 @@ CHUNK_SIZES = (50, 100, 150, 200, 250, 300, 400, 500, 750, 1000, 1250, 1500, 200
 FEW_POINTS = 500_000
 """A chunk below this is not worth cutting further to feed more workers."""
 
-MOST_POINTS = 1_250_000
+MOST_POINTS = 1_500_000
 """Points of a chunk's core above which larger chunks save little buffer work, while memory and the tail of a run grow."""
 
 MANY_BUFFERS = 4
@@ -350,7 +350,7 @@ def _choose(survey: Survey, params: RunParams, buffer: int, memory: float) -> Ch
     last = params.returns == "last"
     total = sum(_eligible(t, last) for t in survey.tiles)
     densest = max((_eligible(t, last) / max(_extent(t), 1) for t in survey.tiles), default=0.0)
-    enough = max(min(max(total / 8, FEW_POINTS), MOST_POINTS), densest * (MANY_BUFFERS * buffer) ** 2)
+    enough = max(min(max(total / 3, FEW_POINTS), MOST_POINTS), densest * (MANY_BUFFERS * buffer) ** 2)
     chosen = CHUNK_SIZES[0]
     for size in CHUNK_SIZES:
         edge = size * MM
