@@ -6,10 +6,11 @@ import getpass
 import ipaddress
 import json
 import os
+import signal
 import socket
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -17,7 +18,7 @@ from urllib.parse import urlsplit
 from ppdf_dask.errors import ClusterError
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, LocalCluster
 
 SINGLE = {
     "NUMBA_NUM_THREADS": "1",
@@ -70,6 +71,7 @@ def local_cluster(workers: int | None = None) -> Iterator[Client]:
     config = {
         "distributed.nanny.pre-spawn-environ": {**before, **SINGLE},
         "distributed.worker.daemon": True,
+        "distributed.worker.preload": [*dask.config.get("distributed.worker.preload"), "ppdf_dask.quiet_worker"],
     }
     with (
         dask.config.set(config),
@@ -83,7 +85,20 @@ def local_cluster(workers: int | None = None) -> Iterator[Client]:
         ) as cluster,
         Client(cluster) as client,
     ):
-        yield client
+        try:
+            yield client
+        except BaseException:
+            _kill_workers(cluster)
+            raise
+
+
+def _kill_workers(cluster: LocalCluster) -> None:
+    """End the workers at once: asked politely, a busy one takes many seconds, and a run survives any death."""
+    for nanny in cluster.workers.values():
+        nanny.auto_restart = False
+        if nanny.process is not None and nanny.process.pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(nanny.process.pid, signal.SIGKILL)
 
 
 @contextmanager

@@ -217,8 +217,7 @@ class _Check:
                 kind: Kind = "foreign"
                 if not all(self.store.get(f"dtm/{n}/c/{row}/{column}") for n in names):
                     kind = "missing"
-                path, record = f"dtm/*/c/{row}/{column}", f"ledger/dtm/{work.ident}"
-                self._add(kind, path, "is not what its record says", record)
+                self._add(kind, f"dtm/*/c/{row}/{column}", "is not what its record says", f"ledger/dtm/{work.ident}")
                 continue
             self.report.counts["pixels"] += int((~np.isnan(layers[0])).sum())
         export = self.cutting.cog_work([w for w in works if w.ident in blocks], waiting)

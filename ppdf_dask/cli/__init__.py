@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 import click
@@ -75,20 +76,29 @@ def group() -> None:
     """
 
 
+def _interrupts(error: BaseException | None) -> int:
+    """Count the interrupts that led to an error: a second one arrives while the first is being handled."""
+    found = 0
+    while error is not None:
+        found += isinstance(error, KeyboardInterrupt)
+        error = error.__cause__ or error.__context__
+    return found
+
+
 def main() -> None:
     """Run the command line; the console script."""
     try:
         group(standalone_mode=False)
-    except click.exceptions.Abort:
+    except (click.exceptions.Abort, KeyboardInterrupt) as stop:
+        click.echo("stopped; the same command goes on where it stopped", err=True)
+        if _interrupts(stop) > 1:
+            os._exit(130)  # Threads of the cluster may still wait for something: a second Ctrl-C must not.
         sys.exit(130)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
-    except KeyboardInterrupt:
-        click.echo("stopped; the same command goes on where it stopped", err=True)
-        sys.exit(130)
     except BrokenPipeError:
         sys.exit(141)
     except PpdfError as error:
