@@ -8,21 +8,28 @@ import json
 import os
 import sys
 
-answer = os.fdopen(os.dup(1), "wb")
-os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
-import CSF  # noqa: E402
-import numpy as np  # noqa: E402
+def main() -> None:
+    """Answer one request."""
+    answer = os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
-settings = json.loads(sys.stdin.buffer.readline())
-xyz = np.frombuffer(sys.stdin.buffer.read(), np.float64).reshape(-1, 3)
-csf = CSF.CSF()
-for name, value in settings.items():
-    setattr(csf.params, name, value)
-csf.setPointCloud(xyz)
-ground, other = CSF.VecInt(), CSF.VecInt()
-csf.do_filtering(ground, other, False)
-mask = np.zeros(len(xyz), np.uint8)
-mask[np.fromiter(ground, np.int64, len(ground))] = 1
-answer.write(mask.tobytes())
-answer.close()
+    import CSF
+    import numpy as np
+
+    settings = json.loads(sys.stdin.buffer.readline())
+    xyz = np.frombuffer(sys.stdin.buffer.read(), np.float64).reshape(-1, 3)
+    csf = CSF.CSF()
+    for name, value in settings.items():
+        setattr(csf.params, name, value)
+    csf.setPointCloud(xyz)
+    ground, other = CSF.VecInt(), CSF.VecInt()
+    csf.do_filtering(ground, other, False)
+    mask = np.zeros(len(xyz), np.uint8)
+    mask[np.fromiter(ground, np.int64, len(ground))] = 1
+    answer.write(mask.tobytes())
+    answer.close()
+
+
+if __name__ == "__main__":
+    main()
