@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +16,7 @@ from statistics import median
 from typing import Any
 from unittest.mock import patch
 
+from ppdf_dask.errors import PpdfError
 from ppdf_dask.params import Parameters
 
 _ROBUST = "ppdf_dask.filters.ppdf.robust"
@@ -41,6 +45,10 @@ STAGES: dict[str, dict[str, str]] = {
     },
 }
 """Kind of parameters to the functions that are stages of their filter; they are not nested in each other."""
+
+
+KEEP_NOTHING = {"MALLOC_MMAP_THRESHOLD_": "131072", "MALLOC_TRIM_THRESHOLD_": "131072"}
+"""Tells glibc to give freed arrays back at once, so that the resident size is what is held."""
 
 
 @dataclass(frozen=True)
@@ -173,3 +181,27 @@ def _clocked(function: Callable[..., Any], stage: str, record: Recorder, base: i
                 record.peak[stage] = max(record.peak.get(stage, 0), held)
 
     return call
+
+
+def child(asked: dict[str, Any], environment: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Ask `ppdf_dask.experiments._filter_child` in a new process.
+
+    Raises
+    ------
+    PpdfError
+        When the process fails; the message holds what it said last.
+    """
+    command = [sys.executable, "-m", "ppdf_dask.experiments._filter_child"]
+    done = subprocess.run(
+        command,
+        input=json.dumps(asked),
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | KEEP_NOTHING | dict(environment or {}),
+    )
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise PpdfError(f"measuring {asked['filter']} in a process of its own failed: {last}")
+    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return answer

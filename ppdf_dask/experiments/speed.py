@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from ppdf_dask import filters
-from ppdf_dask.errors import PpdfError
-from ppdf_dask.experiments.clock import Recorder, Timing, interleaved, recorded, timings
+from ppdf_dask.experiments.clock import Recorder, Timing, child, interleaved, recorded, timings
 from ppdf_dask.experiments.labelled import read
 from ppdf_dask.experiments.tables import markdown, number
 from ppdf_dask.filters.cloud import Cloud, density
@@ -26,9 +22,6 @@ from ppdf_dask.params import Parameters, RunParams
 
 DECODE, COPY = "decode", "copy"
 """Names of the yardsticks: laspy and lazrs read the file, and read and write it, on one thread."""
-
-KEEP_NOTHING = {"MALLOC_MMAP_THRESHOLD_": "131072", "MALLOC_TRIM_THRESHOLD_": "131072"}
-"""Tells glibc to give freed arrays back at once, so that the resident size is what is held."""
 
 
 @dataclass(frozen=True)
@@ -371,30 +364,6 @@ def compilation(choice: Choice) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
         cold, warm = (child(asked, {"NUMBA_CACHE_DIR": folder})["first"] for _ in range(2))
     return cold, warm
-
-
-def child(asked: dict[str, Any], environment: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Ask `ppdf_dask.experiments._filter_child` in a new process.
-
-    Raises
-    ------
-    PpdfError
-        When the process fails; the message holds what it said last.
-    """
-    command = [sys.executable, "-m", "ppdf_dask.experiments._filter_child"]
-    done = subprocess.run(
-        command,
-        input=json.dumps(asked),
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | KEEP_NOTHING | dict(environment or {}),
-    )
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise PpdfError(f"measuring {asked['filter']} in a process of its own failed: {last}")
-    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return answer
 
 
 def synthetic_files(folder: Path) -> list[Path]:
