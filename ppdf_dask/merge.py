@@ -6,13 +6,14 @@ is decoded once more and compared, and only then gets its own name.
 
 from __future__ import annotations
 
+import io
 import os
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import laspy
 import numpy as np
@@ -65,7 +66,7 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
     job : TileJob
         The source.
     target : Path
-        The result; LAZ.
+        The result; LAS when its name ends in ``.las``, else LAZ.
     ground_of : callable
         Gives for each batch, in file order, the mask of its points found ground.
 
@@ -80,10 +81,13 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
         The source is damaged or changed, or the written file does not read back as it was meant.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    # Short, for the target's own name may be as long as names can be.
+    part = target.with_name(f".{zlib.crc32(target.name.encode()):08x}.{os.getpid()}.part")
     try:
-        meant = _copy(job, part, ground_of)
+        meant = _copy(job, part, ground_of, compress=target.suffix != ".las")
         _verify(part, meant)
+        if job.tile.version == "1.0":
+            _set_minor_version(part, 0)
         os.replace(part, target)
     except (LaspyException, OSError) as error:
         raise TileError(f"{shown(job.tile.path)} could not be written to {target}: {error}") from error
@@ -94,35 +98,43 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
 
 
 class _Histogram:
-    """Counts and a running checksum of the classes, to compare what was meant with what was written."""
+    """Counts and running checksums of classes and whole records: what was meant against what was written."""
 
     def __init__(self) -> None:
-        self.points, self.changed, self.crc = 0, 0, 0
+        self.points, self.changed, self.crc, self.records = 0, 0, 0, 0
         self.classes = np.zeros(256, np.int64)
 
-    def add(self, classes: npt.NDArray[np.uint8]) -> None:
+    def add(self, classes: npt.NDArray[np.uint8], records: npt.NDArray[Any]) -> None:
         self.points += len(classes)
+        self.records = zlib.crc32(np.ascontiguousarray(records).view(np.uint8).data, self.records)
         self.classes += np.bincount(classes, minlength=256)
         self.crc = zlib.crc32(np.ascontiguousarray(classes).tobytes(), self.crc)
 
     def record(self) -> dict[str, Any]:
         histogram = {str(k): int(self.classes[k]) for k in np.flatnonzero(self.classes)}
-        return {"points": self.points, "changed": self.changed, "classes": histogram, "crc32": self.crc}
+        return {
+            "points": self.points,
+            "changed": self.changed,
+            "classes": histogram,
+            "crc32": self.crc,
+            "records_crc32": self.records,
+        }
 
 
-def _copy(job: TileJob, part: Path, ground_of: GroundOf) -> _Histogram:
+def _copy(job: TileJob, part: Path, ground_of: GroundOf, *, compress: bool) -> _Histogram:
     decoder, meant = Decoder.of(job.tile, job.unit_xy, job.unit_z, job.params.classes, job.params.returns), _Histogram()
     job.tile.check_unchanged()
-    with laspy.open(job.tile.path, laz_backend=laspy.LazBackend.Lazrs) as source:
+    backend = laspy.LazBackend.Lazrs
+    with _opened(job.tile.path) as file, laspy.open(file, closefd=False, laz_backend=backend) as source:
         header = plain_header(source.header)
-        with laspy.open(part, "w", header=header, laz_backend=laspy.LazBackend.Lazrs, do_compress=True) as out:
+        with laspy.open(part, "w", header=header, laz_backend=backend, do_compress=compress) as out:
             for points in source.chunk_iterator(BATCH):
                 batch = decoder.measure(points.array, meant.points)
                 classes = new_classes(batch.classification, batch.eligible, ground_of(batch), job.params.classes)
                 meant.changed += int((classes != batch.classification).sum())
                 points.classification = classes
                 out.write_points(points)
-                meant.add(classes)
+                meant.add(classes, points.array)
             evlrs = [v for v in source.evlrs or [] if v.user_id != "copc"]
             if evlrs:
                 out.write_evlrs(laspy.vlrs.vlrlist.VLRList(evlrs))
@@ -130,6 +142,33 @@ def _copy(job: TileJob, part: Path, ground_of: GroundOf) -> _Histogram:
     if meant.points != job.tile.point_count:
         raise TileError(f"{shown(job.tile.path)} holds {meant.points} points, its header says {job.tile.point_count}")
     return meant
+
+
+class _AsVersion11(io.FileIO):
+    """A LAS 1.0 file that calls itself 1.1, for laspy does not know 1.0; the two differ in reserved fields only."""
+
+    def readinto(self, buffer: Any, /) -> int:
+        start = self.tell()
+        got = super().readinto(buffer)
+        if start <= _MINOR_VERSION < start + got:
+            buffer[_MINOR_VERSION - start] = 1
+        return got
+
+
+_MINOR_VERSION = 25
+"""Byte of the header that tells LAS 1.0 from 1.4."""
+
+
+def _opened(path: str | Path) -> BinaryIO:
+    with open(path, "rb") as file:
+        old = file.read(_MINOR_VERSION + 1)[_MINOR_VERSION:] == b"\0"
+    return io.BufferedReader(_AsVersion11(path)) if old else open(path, "rb")
+
+
+def _set_minor_version(path: Path, minor: int) -> None:
+    with path.open("r+b") as file:
+        file.seek(_MINOR_VERSION)
+        file.write(bytes([minor]))
 
 
 def plain_header(header: laspy.LasHeader) -> laspy.LasHeader:
@@ -140,7 +179,7 @@ def plain_header(header: laspy.LasHeader) -> laspy.LasHeader:
 
 
 def class_counts(path: Path) -> dict[str, Any]:
-    """Count points and classes of a written file again: ``points``, ``classes``, ``crc32`` as in its record.
+    """Count points and classes of a written file again: the checksums among them as in its record.
 
     Raises
     ------
@@ -158,7 +197,7 @@ def class_counts(path: Path) -> dict[str, Any]:
 
 def _verify(part: Path, meant: _Histogram) -> None:
     found = _count(part)
-    if (found.points, found.crc) != (meant.points, meant.crc):
+    if (found.points, found.crc, found.records) != (meant.points, meant.crc, meant.records):
         raise TileError(
             f"{part} does not read back as written ({found.points} of {meant.points} points); "
             "check the disk and run again"
@@ -167,10 +206,9 @@ def _verify(part: Path, meant: _Histogram) -> None:
 
 def _count(path: Path) -> _Histogram:
     found = _Histogram()
-    only = laspy.DecompressionSelection.base() | laspy.DecompressionSelection.CLASSIFICATION
-    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, decompression_selection=only) as reader:
+    with _opened(path) as file, laspy.open(file, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
         for points in reader.chunk_iterator(BATCH):
-            found.add(np.asarray(points.classification, np.uint8))
+            found.add(np.asarray(points.classification, np.uint8), points.array)
     return found
 
 

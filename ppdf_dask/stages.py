@@ -131,7 +131,9 @@ class Cutting:
         """Box around all eligible points and all that is unknown."""
         boxes = [Rect(*r["bounds"]) for r in self.tiles.values() if r["bounds"] and r["eligible"]]
         boxes += self.unknown
-        found = boxes[0] if boxes else Rect(0, 0, 0, 0)
+        # Nothing to look at still makes a terrain model: one without a height.
+        boxes = boxes or [Rect(*r["bounds"]) for r in self.tiles.values() if r["bounds"]] or [Rect(0, 0, 1, 1)]
+        found = boxes[0]
         for box in boxes[1:]:
             found = found.union(box)
         return found

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Duplicates", "Overlap", "Problem", "Survey", "Tile", "find_overlaps", "measure", "scan"]
 
+WAVEFORM_FORMATS = (4, 5, 9, 10)
+"""Point formats with waveform packets: lazrs 0.8.2 loses them in formats 9 and 10, LASzip cannot read its 4 and 5."""
+
+_WAVEFORM = "has waveform packets; its result is written uncompressed (.las), for LAZ writers do not agree on them"
+
 _DEGREE_SCALE = 1e-5
 _DEGREES = "has no CRS and looks like degrees; reproject it, or say the unit with --assume-units"
 
@@ -306,9 +311,10 @@ def _tile(path: str, name: str, header: Header, frame: Frame) -> tuple[Tile, lis
     """Return the tile and what is odd about it; only impossible header bounds make it read the points."""
     unit_xy, unit_z = frame.unit_xy or 1.0, frame.unit_z or frame.unit_xy or 1.0
     found = bounds_in_mm(header.mins, header.maxs, unit_xy, unit_z) if _bounds_possible(header) else None
+    uncompressed = header.point_format in WAVEFORM_FORMATS
     tile = Tile(
         path=path,
-        name=name,
+        name=f"{name.removesuffix('.laz')}.las" if uncompressed else name,
         size=header.size,
         mtime_ns=header.mtime_ns,
         version=header.version,
@@ -328,14 +334,15 @@ def _tile(path: str, name: str, header: Header, frame: Frame) -> tuple[Tile, lis
     )
     if header.point_count == 0:
         return tile, [Problem(path, "no-points", "has no points; an empty tile is written", False)]
+    notes = [Problem(path, "waveform", _WAVEFORM, False)] if uncompressed else []
     if found:
-        return tile, []
+        return tile, notes
     try:
         bounds, z_range = measure(tile, unit_xy, unit_z)
     except TileError as error:
         return tile, [Problem(path, "corrupt", str(error), True)]
     message = "has header bounds that cannot be true; they were measured by reading its points"
-    return replace(tile, bounds=bounds, z_range=z_range), [Problem(path, "bounds", message, False)]
+    return replace(tile, bounds=bounds, z_range=z_range), [*notes, Problem(path, "bounds", message, False)]
 
 
 def measure(tile: Tile, unit_xy: float, unit_z: float) -> tuple[Rect, tuple[float, float]]:

@@ -53,7 +53,8 @@ class Tile:
     path : str
         Absolute path as found (symbolic links are not resolved).
     name : str
-        Where its result goes, relative to the output's ``laz`` folder: forward slashes, ends in ``.laz``.
+        Where its result goes, relative to the output's ``laz`` folder: forward slashes, ends in ``.laz`` (``.las`` for
+        point formats with waveforms).
     size, mtime_ns : int
         Bytes and modification time at the scan; both are checked again whenever the file is read.
     version : str

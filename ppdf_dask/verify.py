@@ -187,7 +187,7 @@ class _Check:
             except (TileError, OSError) as error:
                 self._file("torn", path, f"cannot be read: {error}", f"merge/{source}")
                 continue
-            same = all(found[k] == record[k] for k in ("points", "classes", "crc32"))
+            same = all(found[k] == record[k] for k in ("points", "classes", "records_crc32"))
             if not same or path.stat().st_size != record["bytes"]:
                 self._file("flipped", path, "has other points or classes than were written", f"merge/{source}")
                 continue
