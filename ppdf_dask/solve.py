@@ -187,9 +187,9 @@ def cover(x: Int64, y: Int64, width: int) -> list[Rect]:
     """
     box = Rect(int(x.min()), int(y.min()), int(x.max()) + 1, int(y.max()) + 1)
     whole = _area(box, width)
-    if whole <= 2 * (2 * width) ** 2:
-        return [box]
     wide = box.width >= box.height
+    if whole <= 2 * (2 * width) ** 2 or max(box.width, box.height) == 1:
+        return [box]
     along, middle = (x, (box.x0 + box.x1) // 2) if wide else (y, (box.y0 + box.y1) // 2)
     first = along < middle
     parts = cover(x[first], y[first], width) + cover(x[~first], y[~first], width)
