@@ -212,17 +212,15 @@ def raised(low, c, name, cells, patch, root, planes, params):
     for (i, j), (dx, dy) in product(cells, ((1, 0), (-1, 0), (0, 1), (0, -1))):
         plane = planes[patch[i, j]]
         tilt = sqrt(plane[0] ** 2 + plane[1] ** 2)
-        met = falls = False
+        falls = False
         for far in range(1, 13):
             n = i + far * dx, j + far * dy
             if n in patch and root(patch[n]) == name:
                 break
-            if n in low:
-                met = True
-                if far * c <= round(params.border_reach * 1000):
-                    falls |= height(plane, low[n], c) < -(params.border_drop + 0.5 * tilt * far * (c * 1e-3))
+            if n in low and far * c <= round(params.border_reach * 1000):
+                falls |= height(plane, low[n], c) < -(params.border_drop + 0.5 * tilt * far * (c * 1e-3))
         else:
-            borders += met
+            borders += 1
             drops += falls
     return drops > params.border_share * borders
 

@@ -125,22 +125,20 @@ def judge_components(
         box[root, 3] = max(box[root, 3], row)
         tilt = np.sqrt(planes[p, 0] ** 2 + planes[p, 1] ** 2)
         for direction in range(4):
-            met = False
+            inside = False
             falls = False
             j = k
             for far in range(1, look_out + 1):
                 j += shift[direction]
                 if patch[j] >= 0 and parent[patch[j]] == root:
-                    met = False
+                    inside = True
                     break
                 if state[j] & UNPROVEN:
                     open_[root] = True
-                if state[j] & LOW:
-                    met = True
-                    if far * cell <= reach and not falls:
-                        fall = drop + 0.5 * tilt * far * (cell * 1e-3)
-                        falls = residual(planes, squares, p, pos, j, cell) < -fall
-            if met:
+                if state[j] & LOW and far * cell <= reach and not falls:
+                    fall = drop + 0.5 * tilt * far * (cell * 1e-3)
+                    falls = residual(planes, squares, p, pos, j, cell) < -fall
+            if not inside:
                 borders[root] += 1
                 drops[root] += falls
     verdict = np.zeros(count, np.uint8)
