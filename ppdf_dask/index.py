@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ppdf_dask.ledger import digest
-from ppdf_dask.store import RunStore
+from ppdf_dask.store import RunStore, record_path
 
 Parts = dict[str, dict[str, tuple[int, str]]]
 """Part (core, buffer) to source to (points, fingerprint)."""
@@ -67,12 +67,12 @@ class Index:
         """Write the index, and remove the fragments it does not know."""
         key = digest(self.chunks)
         complete = store.get_record("index", "key") == {"digest": key}
-        if complete and all(store.has(f"ledger/index/{chunk}") for chunk in self.chunks):
+        if complete and all(store.has(record_path("index", chunk)) for chunk in self.chunks):
             return
         store.drop_record("index", "key")
         for chunk, parts in self.chunks.items():
             store.put_record("index", chunk, {"parts": parts})
-        for chunk in store.children("ledger/index"):
+        for chunk in list(store.recorded("index")):
             if chunk != "key" and chunk not in self.chunks:
                 store.drop_record("index", chunk)
         for path in list(self.orphans(store)):
@@ -120,11 +120,11 @@ def fragments(store: RunStore, chunk: str, part: str) -> dict[str, npt.NDArray[n
 
 def parts_of(store: RunStore, chunk: str) -> Parts:
     """Return what a chunk consists of; nothing where the index knows of nothing."""
-    record = store.get_node(f"ledger/index/{chunk}")
+    record = store.get_node(record_path("index", chunk))
     return {} if record is None else record["parts"]
 
 
 def owns_points(store: RunStore, chunk: str) -> bool:
     """Tell whether a chunk has core points, so that it must have a classification."""
-    record = store.get_node(f"ledger/index/{chunk}")
+    record = store.get_node(record_path("index", chunk))
     return record is not None and bool(record["parts"]["core"])

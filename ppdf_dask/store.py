@@ -7,8 +7,8 @@ Layout of ``run.zarr`` (each leaf has exactly one writer)::
     classification/<chunk>           uint8 (n): 1 ground, 0 not, 255 never written; order of the core fragments
     ground/<chunk>                   int32 (3, n): the ground points, for the terrain model
     dtm/{height,distance,y,x}        float32 blocks of the global raster, one shard each
-    ledger/<stage>/<id>              what is done: a Zarr group whose attributes are the record
-    ledger/index/<chunk>             which fragments a chunk consists of, and of how many points (`ppdf_dask.index`)
+    ledger/<stage>/<shard>/<id>      what is done: a Zarr group whose attributes are the record (`record_path`)
+    ledger/index/<shard>/<chunk>     which fragments a chunk consists of, and of how many points (`ppdf_dask.index`)
 
 Every object is written by one atomic put of its final bytes, an array's metadata after its data: no rename is needed of
 the store behind it, an array that is there is whole, and a task that runs twice at once does no harm. Every array
@@ -31,7 +31,7 @@ from zarr.storage import MemoryStore
 from ppdf_dask.errors import DamagedError, StoreError
 from ppdf_dask.objects import ObjectStore, node_bytes
 
-FORMAT = 2
+FORMAT = 3
 """Version of the layout above; a store of another version is refused."""
 
 # Bit shuffling in zstd packs the integers of a fragment to 4 to 6 bytes a point at 50 million points a second; a delta
@@ -261,25 +261,30 @@ class RunStore(ObjectStore):
 
     def put_record(self, stage: str, ident: str, record: dict[str, Any]) -> None:
         """Publish a record by one atomic put."""
-        self.put_node(f"ledger/{stage}/{ident}", record)
+        self.put_node(record_path(stage, ident), record)
 
     def get_record(self, stage: str, ident: str) -> dict[str, Any] | None:
         """Return a record; None when there is none, or what is there is torn: its work is to be done again."""
         try:
-            return self.get_node(f"ledger/{stage}/{ident}")
+            return self.get_node(record_path(stage, ident))
         except DamagedError:
             return None
 
     def records(self, stage: str) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the records of a stage, sorted by id."""
-        for ident in self.children(f"ledger/{stage}"):
+        """Yield the records of a stage by shard and id."""
+        for ident in self.recorded(stage):
             record = self.get_record(stage, ident)
             if record is not None:
                 yield ident, record
 
+    def recorded(self, stage: str) -> Iterator[str]:
+        """Yield the ids that a stage has records of, by shard and id."""
+        for shard in self.children(f"ledger/{stage}"):
+            yield from self.children(f"ledger/{stage}/{shard}")
+
     def drop_record(self, stage: str, ident: str) -> None:
         """Remove a record: its work is to be done again."""
-        self.delete(f"ledger/{stage}/{ident}/zarr.json")
+        self.delete(f"{record_path(stage, ident)}/zarr.json")
 
     # -- lock -----------------------------------------------------------------------------------------------------
 
@@ -389,3 +394,14 @@ def _raster(path: str, shape: tuple[int, ...], block: int, attributes: dict[str,
         attributes=attributes,
     )
     return objects, array
+
+
+def record_path(stage: str, ident: str) -> str:
+    """Return the path of a record; up to a thousand that differ in their last three characters share a folder.
+
+    Examples
+    --------
+    >>> record_path("classify", "c_0012_3456"), record_path("index", "key")
+    ('ledger/classify/c_0012_3/c_0012_3456', 'ledger/index/_/key')
+    """
+    return f"ledger/{stage}/{ident[:-3] or '_'}/{ident}"

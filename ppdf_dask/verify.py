@@ -24,7 +24,7 @@ from ppdf_dask.raster import checksum
 from ppdf_dask.repair import leftovers, maker, note
 from ppdf_dask.saved import load_plan
 from ppdf_dask.stages import Cutting, Inputs, Records
-from ppdf_dask.store import RunStore
+from ppdf_dask.store import RunStore, record_path
 from ppdf_dask.tasks import crc32_of
 
 Kind = Literal["missing", "torn", "flipped", "foreign", "orphaned"]
@@ -151,7 +151,9 @@ class _Check:
         for chunk, parts in self.cutting.index.chunks.items():
             record = self.store.get_record("index", chunk)
             if record is None or digest(record.get("parts")) != digest(parts):
-                self._add("torn" if record is None else "foreign", f"ledger/index/{chunk}", "is not what the tiles say")
+                self._add(
+                    "torn" if record is None else "foreign", record_path("index", chunk), "is not what the tiles say"
+                )
             for part, sources in parts.items():
                 for source, expected in sources.items():
                     try:
@@ -209,7 +211,7 @@ class _Check:
                 layers = [self.store.read_block(name, row, column, BLOCK) for name in names]
             except DamagedError as error:
                 if error.path.count("/") > 1:
-                    self._add("flipped", error.path, str(error), f"ledger/dtm/{work.ident}")
+                    self._add("flipped", error.path, str(error), record_path("dtm", work.ident))
                     continue
                 self._damage(error)
                 return
@@ -217,7 +219,9 @@ class _Check:
                 kind: Kind = "foreign"
                 if not all(self.store.get(f"dtm/{n}/c/{row}/{column}") for n in names):
                     kind = "missing"
-                self._add(kind, f"dtm/*/c/{row}/{column}", "is not what its record says", f"ledger/dtm/{work.ident}")
+                self._add(
+                    kind, f"dtm/*/c/{row}/{column}", "is not what its record says", record_path("dtm", work.ident)
+                )
                 continue
             self.report.counts["pixels"] += int((~np.isnan(layers[0])).sum())
         export = self.cutting.cog_work([w for w in works if w.ident in blocks], waiting)
@@ -267,7 +271,7 @@ class _Check:
         self._add(error.kind, error.path, str(error))  # type: ignore[arg-type]
 
     def _file(self, kind: Kind, path: Path, what: str, record: str) -> None:
-        self._add(kind, str(path), what, f"ledger/{record}")
+        self._add(kind, str(path), what, record_path(*record.split("/")))
 
     def _orphan(self, path: str, what: str) -> None:
         self._add("orphaned", path, what, None)

@@ -107,7 +107,7 @@ def finished(out: Path) -> set[str]:
     """Return the pieces of work that the ledger calls done, as ``stage-id``."""
     ledger = out / "run.zarr" / "ledger"
     stages = ("tile", "classify", "merge", "dtm", "cog")
-    return {f"{s}-{p.parent.name}" for s in stages for p in (ledger / s).glob("*/zarr.json")}
+    return {f"{s}-{p.parent.name}" for s in stages for p in (ledger / s).glob("*/*/zarr.json")}
 
 
 @contextmanager
