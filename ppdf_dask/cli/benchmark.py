@@ -23,7 +23,12 @@ from ppdf_dask.cli.show import (
 
 @click.group()
 def benchmark() -> None:
-    """Measure accuracy on labelled clouds, speed, and runtime against density."""
+    """Measure accuracy on labelled clouds, speed, and runtime against density.
+
+    \b
+    ppdf-dask benchmark accuracy DATA --score "user_data==0"
+    ppdf-dask benchmark speed cloud.laz
+    """
 
 
 @benchmark.command()
