@@ -273,7 +273,7 @@ def test_credentials_reach_neither_records_nor_logs(small_survey, tmp_path):
     doctor = subprocess.run(
         [sys.executable, "-m", "ppdf_dask", "doctor", "--json"], env=environment, capture_output=True, check=True
     )
-    texts = [ran.stdout, ran.stderr, doctor.stdout, log.read_bytes()]
+    texts = [ran.stdout.encode(), ran.stderr.encode(), doctor.stdout, log.read_bytes()]
     texts += [p.read_bytes() for p in out.rglob("*") if p.is_file()]
     assert len(texts) > 20
     assert not [secret for secret in SECRETS.values() for text in texts if secret.encode() in text]
