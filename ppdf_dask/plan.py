@@ -46,10 +46,10 @@ FEW_POINTS = 500_000
 """A chunk below this is not worth cutting further to feed more workers."""
 
 MOST_POINTS = 1_500_000
-"""Points of a chunk's core above which larger chunks save little buffer work, while memory and the tail of a run grow."""
+"""Points of a core above which larger chunks save little buffer work, while memory and the tail of a run grow."""
 
 MANY_BUFFERS = 4
-"""A chunk is made at least so many buffers wide where memory allows: then buffers are at most 5/4 of the core's points."""
+"""A chunk is at least so many buffers wide where memory allows: then buffers are at most 5/4 of the core's points."""
 
 
 @dataclass(frozen=True)
