@@ -71,6 +71,16 @@ class Result:
 
         return ResultPlots(self)
 
+    def drop_intermediate(self) -> int:
+        """Remove the intermediate points, most of ``run.zarr``; return the bytes that are free now.
+
+        All results stay, and the same run finds nothing left to do. A later run with other parameters cuts the tiles
+        again; `open_points` and `ppdf-dask seams` need the points.
+        """
+        from ppdf_dask.dropped import drop_points
+
+        return drop_points(self.out)
+
     @property
     def chunks(self) -> list[str]:
         """Ids of the chunks that hold points."""

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ppdf_dask import __version__, tasks
+from ppdf_dask.dropped import cut_again
 from ppdf_dask.errors import DamagedError, PartialRunError, PlanError, SurveyError
 from ppdf_dask.events import Event, Listener, ignore
 from ppdf_dask.execute import Stage, Work, execute, nothing
@@ -128,6 +129,8 @@ class _Run:
         self.waiting, self.damaged = [], []
         try:
             self.tile()
+            if cut_again(self.store, self.cutting):
+                self.tile()
             if self.tiles or not self.failures:
                 self.classify()
                 self.merge()

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ppdf_dask import filters
+from ppdf_dask.dropped import are_dropped
 from ppdf_dask.errors import StoreError
 from ppdf_dask.filters.cloud import Cloud
 from ppdf_dask.grid import MM, Chunk, Rect
@@ -158,7 +159,7 @@ def measure(run: str | Path, tick: Tick = lambda chunk: None) -> Seams:
     tiles = {s: r for s, r in store.records("tile") if s in keys and r["fingerprint"] == keys[s]}
     cutting = Cutting(inputs, store, tiles)
     ids = sorted(cutting.index.points)
-    if ids and not store.chunks():
+    if are_dropped(store):
         raise StoreError(f"the points of {run} were dropped; run again without --drop-intermediate into another folder")
     chosen = filters.of(cutting.filter)
     band = plan.buffer // 2

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 from ppdf_dask import __version__, filters
+from ppdf_dask.dropped import kept_density
 from ppdf_dask.dtm import DtmGrid, Raster
 from ppdf_dask.execute import Work
 from ppdf_dask.filters.cloud import Density
@@ -141,6 +142,9 @@ class Cutting:
     @cached_property
     def density(self) -> Density:
         """Points and occupied cells of the survey; cells that several tiles share are united."""
+        kept = kept_density(self.store, self.tiles)
+        if kept is not None:
+            return kept
         cells = 0
         for chunk, parts in self.index.chunks.items():
             sources = list(parts["core"])

@@ -81,8 +81,15 @@ def plan(tiles: tuple[str, ...], as_json: bool, **options: Any) -> None:
 @click.option("--overwrite", is_flag=True, help="Start anew where a run exists.")
 @click.option("--accept-changes", is_flag=True, help="Go on with changed inputs or parameters; redo what they touch.")
 @click.option("--force-unlock", is_flag=True, help="Take the folder's lock from a run that is surely gone.")
+@click.option("--drop-intermediate", is_flag=True, help="Remove the intermediate points once all is done.")
 def run(
-    tiles: tuple[str, ...], out: Path, overwrite: bool, accept_changes: bool, force_unlock: bool, **options: Any
+    tiles: tuple[str, ...],
+    out: Path,
+    overwrite: bool,
+    accept_changes: bool,
+    force_unlock: bool,
+    drop_intermediate: bool,
+    **options: Any,
 ) -> None:
     """Classify a survey: tiles in, classified tiles and a terrain model out. Run it again to resume.
 
@@ -101,6 +108,8 @@ def run(
     if not cluster["quiet"]:
         click.echo(repr(made), err=True)
     result = _run(made, cluster, overwrite=overwrite, accept_changes=accept_changes, force_unlock=force_unlock)
+    if drop_intermediate:
+        result.drop_intermediate()
     if not cluster["quiet"]:
         click.echo(repr(result))
 
