@@ -65,9 +65,7 @@ class Index:
 
     def publish(self, store: RunStore) -> None:
         """Write the index, and remove the fragments it does not know."""
-        key = digest(self.chunks)
-        complete = store.get_record("index", "key") == {"digest": key}
-        if complete and all(store.has(record_path("index", chunk)) for chunk in self.chunks):
+        if self.is_published(store) and all(store.has(record_path("index", chunk)) for chunk in self.chunks):
             return
         store.drop_record("index", "key")
         for chunk, parts in self.chunks.items():
@@ -77,7 +75,11 @@ class Index:
                 store.drop_record("index", chunk)
         for path in list(self.orphans(store)):
             store.drop(path)
-        store.put_record("index", "key", {"digest": key})
+        store.put_record("index", "key", {"digest": digest(self.chunks)})
+
+    def is_published(self, store: RunStore) -> bool:
+        """Tell whether this index, and no older one, was written to its end."""
+        return store.get_record("index", "key") == {"digest": digest(self.chunks)}
 
     def orphans(self, store: RunStore) -> Iterator[str]:
         """Yield the paths of fragments that no finished tile claims, and of results of chunks that are no more."""
