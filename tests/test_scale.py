@@ -8,7 +8,8 @@ import pytest
 from click.testing import CliRunner
 
 from ppdf_dask.cli.scale import scale as command
-from ppdf_dask.experiments.scale import PER_M2, TILE, ScaleTable, cluster, extent_of, measure
+from ppdf_dask.experiments.processes import cluster
+from ppdf_dask.experiments.scale import PER_M2, TILE, ScaleTable, extent_of, measure
 from ppdf_dask.experiments.simulate import PER_TILE, country, simulate
 from ppdf_dask.filters.cloud import Density
 from ppdf_dask.params import ChunkParams, RunParams

@@ -11,14 +11,13 @@ import json
 import math
 import os
 import shutil
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ppdf_dask.experiments.processes import Usage, Watch, cluster
 from ppdf_dask.grid import MM, Rect
 from ppdf_dask.params import RunParams
 from ppdf_dask.synthetic import SyntheticParams
@@ -54,91 +53,6 @@ def extent_of(points: float) -> tuple[float, float, float, float]:
     rows = max(1, round(tiles / columns))
     x, y = EDGE
     return float(x), float(y), float(x + columns * TILE), float(y + rows * TILE)
-
-
-@dataclass
-class Usage:
-    """What one kind of process took.
-
-    Attributes
-    ----------
-    processes : int
-        How many there were.
-    peak_mb : float
-        Largest resident size of any of them, sampled, MB.
-    cpu_seconds : float
-        Processor time of all of them.
-    """
-
-    processes: int = 0
-    peak_mb: float = 0.0
-    cpu_seconds: float = 0.0
-
-
-class Watch:
-    """Samples the processes of a cluster while it is entered."""
-
-    def __init__(self, pids: dict[str, list[int]], every: float = 0.2) -> None:
-        import psutil
-
-        self._every, self._end = every, threading.Event()
-        self._groups = {role: [psutil.Process(p) for p in found] for role, found in pids.items()}
-        self.usage = {role: Usage(len(found)) for role, found in self._groups.items()}
-        self._thread = threading.Thread(target=self._sample, daemon=True)
-
-    def __enter__(self) -> Watch:
-        self._before = self._cpu()
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-        for role, seconds in self._cpu().items():
-            self.usage[role].cpu_seconds = round(seconds - self._before[role], 2)
-
-    def _cpu(self) -> dict[str, float]:
-        return {role: sum(sum(p.cpu_times()[:2]) for p in group) for role, group in self._groups.items()}
-
-    def _sample(self) -> None:
-        while not self._end.is_set():
-            for role, group in self._groups.items():
-                peak = max((p.memory_info().rss for p in group), default=0) / 1e6
-                self.usage[role].peak_mb = round(max(self.usage[role].peak_mb, peak), 1)
-            self._end.wait(self._every)
-
-
-@contextmanager
-def cluster(workers: int) -> Iterator[tuple[Client, dict[str, list[int]]]]:
-    """Start a scheduler and workers as processes of their own; give a client and the process ids by role."""
-    import dask
-    from distributed import Client
-    from distributed.deploy.subprocess import SubprocessCluster
-
-    from ppdf_dask.cluster import SINGLE, memory_per_worker
-
-    before = dask.config.get("distributed.nanny.pre-spawn-environ")
-    with (
-        dask.config.set({"distributed.nanny.pre-spawn-environ": {**before, **SINGLE}}),
-        SubprocessCluster(
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            n_workers=workers,
-            threads_per_worker=1,
-            worker_kwargs={"memory_limit": int(memory_per_worker(workers))},
-        ) as made,
-        Client(made) as client,
-    ):
-        client.wait_for_workers(workers)
-        yield (
-            client,
-            {
-                "workers": list(client.run(os.getpid).values()),
-                "nannies": list(client.run(os.getpid, nanny=True).values()),
-                "scheduler": [client.run_on_scheduler(os.getpid)],
-                "client": [os.getpid()],
-            },
-        )
 
 
 def make_survey(client: Client, folder: Path, points: float) -> list[Path]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ppdf_dask.execute import Stage, Work, execute
-from ppdf_dask.experiments.scale import Usage, Watch, cluster
+from ppdf_dask.experiments.processes import Usage, Watch, cluster
 from ppdf_dask.grid import MM, Rect
 from ppdf_dask.ledger import Ledger
 from ppdf_dask.params import ChunkParams, RunParams
@@ -90,7 +90,7 @@ def country(chunks: int) -> Survey:
     --------
     >>> survey = country(25)
     >>> len(survey.tiles), survey.point_count
-    (4, 40000000)
+    (3, 30000000)
     """
     tiles = -(-chunks // PER_TILE)
     columns = max(1, round((tiles / PER_TILE) ** 0.5))
