@@ -93,7 +93,7 @@ def owners(grid: ChunkGrid, x: Int64, y: Int64) -> Iterator[tuple[int, int, Int6
     Examples
     --------
     >>> x = np.array([0, 5000, 4999, 0])
-    ... y = np.array([0, 0, 0, -1])
+    >>> y = np.array([0, 0, 0, -1])
     >>> [(ix, iy, index.tolist()) for ix, iy, index in owners(ChunkGrid(5000), x, y)]
     [(0, -1, [3]), (0, 0, [0, 2]), (1, 0, [1])]
     """
