@@ -128,8 +128,9 @@ def test_workers_in_jobs(slurm, survey, reference, tmp_path):
     command = [sys.executable, str(DEPLOY / "slurm" / "jobqueue.py"), str(survey), "--out", str(out), "--jobs", "2"]
     command += ["--queue", "main", "--interface", "lo", "--memory", "2GiB", "--minutes", "10"]
     ran = subprocess.run(
-        [*command, "--shared", slurm["PPDF_SHARED"]], env=slurm, capture_output=True, text=True, check=False
-    )
+        [*command, "--shared", slurm["PPDF_SHARED"]],
+        env=slurm, capture_output=True, text=True, check=False, timeout=900,
+    )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
     assert digests(out) == reference
     assert not list(Path(slurm["PPDF_SHARED"]).iterdir()), "certificates are left behind"
