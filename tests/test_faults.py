@@ -110,7 +110,7 @@ TABLE: dict[str, tuple[str, list[str] | str]] = {
         [
             "degenerate::bare_ground_is_found",
             "degenerate::sixty_degrees",
-            "degenerate::a_cliff_is_terrain_unless_it_could_be_a_building",
+            "degenerate::a_cliff_is_terrain",
             "seamless::any_cut_gives_the_mask_of_the_whole_survey",
         ],
     ),
