@@ -6,8 +6,7 @@ Okabe and Ito or run from dark to light, so that people with any colour vision t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from ppdf_dask.errors import ParameterError
 from ppdf_dask.grid import MM, ChunkGrid, Rect
 from ppdf_dask.maps import PALETTE
+from ppdf_dask.plotdata import Line, read_raster, section_points, unit_metres
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from ppdf_dask.plan import Plan
     from ppdf_dask.result import Result
     from ppdf_dask.survey import Survey
-
-Line = Sequence[Sequence[float]]
-"""Two points, ``((x0, y0), (x1, y1))``, in the CRS's units."""
 
 CLASSES = {
     2: ("ground", PALETTE["red"]),
@@ -39,8 +36,6 @@ CLASSES = {
 
 _SAME = {0: 1, 3: 1, 4: 1, 5: 1, 18: 7}
 _OTHER = ("other classes", PALETTE["grey"])
-_PIXELS = 1500
-_BATCH = 1_000_000
 
 
 def survey_map(survey: Survey, ax: Axes | None = None) -> Axes:
@@ -141,7 +136,7 @@ class ResultPlots:
         ParameterError
             If the area does not meet the raster.
         """
-        height, extent, pixel, unit = _read_raster(self._result.out / "dtm.tif", area)
+        height, extent, pixel, unit = read_raster(self._result.out / "dtm.tif", area)
         metres = self._result.summary["plan"]["params"]["dtm"]["resolution"] * pixel
         ax = draw_hillshade(
             height, extent, metres / unit_metres(unit), _axes(ax), sun=(azimuth, altitude), exaggeration=exaggeration
@@ -276,48 +271,6 @@ def draw_hillshade(
     return ax
 
 
-def section_points(
-    tiles: Iterable[Path], line: Line, width: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8]]:
-    """Read the points of LAS or LAZ files within a strip around a line.
-
-    Parameters
-    ----------
-    tiles : iterable of Path
-        The files; one whose header bounds miss the strip is not read.
-    line : sequence of two (x, y)
-        From where to where, in the files' units.
-    width : float
-        Full width of the strip.
-
-    Returns
-    -------
-    along, z : ndarray of float64, shape (n,)
-        Distance from the line's start, and height.
-    classes : ndarray of uint8, shape (n,)
-        As stored.
-
-    Raises
-    ------
-    ParameterError
-        If the line has no length or the width is not positive.
-    """
-    (x0, y0), (x1, y1) = line
-    length = float(np.hypot(x1 - x0, y1 - y0))
-    if not length > 0 or not width > 0:
-        raise ParameterError(f"a section needs a line with a length and a positive width, not {line} and {width}")
-    ux, uy = (x1 - x0) / length, (y1 - y0) / length
-    box = (min(x0, x1) - width, min(y0, y1) - width, max(x0, x1) + width, max(y0, y1) + width)
-    found: list[NDArray[Any]] = [np.empty((3, 0))]
-    for x, y, z, classes in _batches(tiles, box):
-        dx, dy = x - x0, y - y0
-        along, across = dx * ux + dy * uy, dy * ux - dx * uy
-        near = (np.abs(across) <= width / 2) & (along >= 0) & (along <= length)
-        found.append(np.stack([along[near], z[near], classes[near]]))
-    every = np.concatenate(found, axis=1)
-    return every[0], every[1], every[2].astype(np.uint8)
-
-
 def draw_section(along: NDArray[Any], z: NDArray[Any], classes: NDArray[Any], ax: Axes, *, size: float = 2.0) -> Axes:
     """Draw points of a section, one colour per class, ground last.
 
@@ -375,63 +328,6 @@ def draw_planes(xyz: NDArray[Any], planes: Any, ax: Axes) -> Axes:
         squares = [Rect(x, y, x + edge, y + edge) for x, y in corners]
         _rectangles(ax, squares, tuple(colour), f"{size:g} m: {len(squares)} planes")
     return _map_frame(ax, "m")
-
-
-def unit_metres(unit: str) -> float:
-    """Return the metres of a unit as it stands in the terrain model.
-
-    Parameters
-    ----------
-    unit : str
-        ``m``, ``ft``, ``US_survey_foot``, or a number of metres such as ``0.5 m``.
-
-    Examples
-    --------
-    >>> unit_metres("ft"), unit_metres("0.5 m")
-    (0.3048, 0.5)
-    """
-    named = {"": 1.0, "m": 1.0, "ft": 0.3048, "US_survey_foot": 1200 / 3937}
-    return named[unit] if unit in named else float(unit.removesuffix(" m"))
-
-
-def _read_raster(
-    path: Path, area: tuple[float, float, float, float] | None
-) -> tuple[NDArray[np.float32], tuple[float, float, float, float], float, str]:
-    """Return heights, outer edges, how many pixels one of them stands for, and the heights' unit."""
-    import rasterio
-    from rasterio.windows import Window
-
-    with rasterio.open(path) as source:
-        left, top, dx, dy = source.transform.c, source.transform.f, source.transform.a, source.transform.e
-        rows, columns = (0, source.height), (0, source.width)
-        if area is not None:
-            columns = _clip((area[0] - left) / dx, (area[2] - left) / dx, source.width)
-            rows = _clip((area[3] - top) / dy, (area[1] - top) / dy, source.height)
-            if columns[0] >= columns[1] or rows[0] >= rows[1]:
-                raise ParameterError(f"area {area} does not meet the raster, {tuple(source.bounds)}")
-        window = Window.from_slices(rows, columns)
-        step = max(1.0, max(window.width, window.height) / _PIXELS)
-        shape = (max(1, round(window.height / step)), max(1, round(window.width / step)))
-        height = source.read(1, window=window, out_shape=shape)
-        extent = (left + columns[0] * dx, left + columns[1] * dx, top + rows[1] * dy, top + rows[0] * dy)
-        return height, extent, step, source.units[0] or "m"
-
-
-def _clip(first: float, last: float, most: int) -> tuple[int, int]:
-    return max(0, round(first)), min(most, round(last))
-
-
-def _batches(tiles: Iterable[Path], box: tuple[float, float, float, float]) -> Iterator[tuple[NDArray[Any], ...]]:
-    import laspy
-
-    for path in tiles:
-        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
-            low, high = reader.header.mins, reader.header.maxs
-            if low[0] > box[2] or high[0] < box[0] or low[1] > box[3] or high[1] < box[1]:
-                continue
-            for points in reader.chunk_iterator(_BATCH):
-                classes = np.asarray(points.classification)
-                yield np.asarray(points.x), np.asarray(points.y), np.asarray(points.z), classes
 
 
 def _axes(ax: Axes | None, size: tuple[float, float] = (7, 6)) -> Axes:

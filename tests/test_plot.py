@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from ppdf_dask import plot
+from ppdf_dask import plot, plotdata
 from ppdf_dask.errors import ParameterError
 from ppdf_dask.maps import PALETTE
 from ppdf_dask.params import ChunkParams, DtmParams, RunParams
@@ -67,14 +67,14 @@ def test_hillshade_shows_the_stored_heights_where_they_lie(finished):
 
 
 def test_a_large_raster_is_read_from_its_overviews(finished, monkeypatch):
-    monkeypatch.setattr(plot, "_PIXELS", 100)
+    monkeypatch.setattr(plotdata, "PIXELS", 100)
     image = finished.plot.hillshade().images[0]
     assert max(np.ma.getdata(image.get_array()).shape) <= 100
 
 
 def test_a_section_takes_exactly_the_points_of_its_strip(finished):
     (x0, y0), (x1, y1), width = (615.0, 620.0), (705.0, 690.0), 6.0
-    along, z, classes = plot.section_points(finished.tiles, ((x0, y0), (x1, y1)), width)
+    along, z, classes = plotdata.section_points(finished.tiles, ((x0, y0), (x1, y1)), width)
     expected = []
     for path in finished.tiles:
         las = laspy.read(path)
@@ -123,5 +123,5 @@ def test_planes_are_those_of_the_published_method(finished):
 
 
 def test_units_of_heights_become_metres():
-    assert plot.unit_metres("US_survey_foot") == pytest.approx(0.3048006096)
-    assert plot.unit_metres("") == 1.0
+    assert plotdata.unit_metres("US_survey_foot") == pytest.approx(0.3048006096)
+    assert plotdata.unit_metres("") == 1.0
