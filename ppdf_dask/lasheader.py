@@ -84,6 +84,8 @@ class Header:
     maxs: tuple[float, float, float]
     guid: str
     evlr_count: int
+    evlrs: tuple[int, int]
+    waveforms: int
     copc: bool
     laszip: Laszip | None
     wkt: bytes | None
@@ -176,7 +178,7 @@ def _parse(draft: _Draft, mtime_ns: int) -> Header:
             draft.warnings.append(
                 ("legacy-count", f"has two point counts, {count} and {legacy_count} (old field); the first one is used")
             )
-    _read_evlrs(draft, offset, evlr_start, evlr_count)
+    evlr_end = _read_evlrs(draft, offset, evlr_start, evlr_count)
     end = min(
         [draft.size]
         + ([evlr_start] if evlr_count else [])
@@ -210,6 +212,8 @@ def _parse(draft: _Draft, mtime_ns: int) -> Header:
         maxs=(numbers[6], numbers[8], numbers[10]),
         guid=raw[8:24].hex(),
         evlr_count=evlr_count,
+        evlrs=(evlr_start, evlr_end) if evlr_count else (0, 0),
+        waveforms=waveform,
         copc=draft.copc,
         laszip=laszip,
         wkt=draft.wkt,
@@ -261,9 +265,10 @@ def _read_vlrs(draft: _Draft, start: int, end: int, count: int) -> None:
         position += length
 
 
-def _read_evlrs(draft: _Draft, offset: int, start: int, count: int) -> None:
+def _read_evlrs(draft: _Draft, offset: int, start: int, count: int) -> int:
+    """Look at all EVLRs; return the first byte after them."""
     if count == 0:
-        return
+        return start
     if count > _MAX_RECORDS or not offset <= start <= draft.size or count * _EVLR.size > draft.size - start:
         raise Reject("evlr", f"claims {count} EVLRs from byte {start} on; it has {draft.size} bytes")
     position = start
@@ -276,6 +281,7 @@ def _read_evlrs(draft: _Draft, offset: int, start: int, count: int) -> None:
             )
         _take_record(draft, user.split(b"\0")[0], record_id, position, length)
         position += length
+    return position
 
 
 def _take_record(draft: _Draft, user: bytes, record_id: int, position: int, length: int) -> None:

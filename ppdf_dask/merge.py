@@ -1,7 +1,8 @@
 """Masks back into the user's own tiles: every point, in its order, only `classification` changed.
 
-The file is decoded again in full, each point asks the mask of its chunk, and the result goes to a temporary name,
-is decoded once more and compared, and only then gets its own name.
+Each point asks the mask of its chunk. The result goes to a temporary name, is read again and compared, and only then
+gets its own name. Of layered files (formats 6 to 8) one layer is made anew and everything else carried over as bytes
+(`ppdf_dask.relabel`); all others are decoded, encoded and decoded again in full.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from laspy.errors import LaspyException
 
 from ppdf_dask.classes import new_classes
 from ppdf_dask.errors import StoreError, TileError
-from ppdf_dask.reader import BATCH, Batch, Decoder
+from ppdf_dask.lasheader import Header
+from ppdf_dask.reader import BATCH, CLASSES, FLAGS, PLACES, Batch, Decoder, header_of, records
+from ppdf_dask.relabel import can_relabel, differs, relabel
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiler import TileJob, owners
 from ppdf_dask.tiles import shown
@@ -73,7 +76,7 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``points``, ``ground`` (points of the ground class), ``changed``, ``bytes`` and the ``classes`` histogram.
+        ``points``, ``changed``, the ``classes`` histogram, ``bytes`` and ``crc32`` of the file.
 
     Raises
     ------
@@ -83,18 +86,33 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
     target.parent.mkdir(parents=True, exist_ok=True)
     # Short, for the target's own name may be as long as names can be.
     part = target.with_name(f".{zlib.crc32(target.name.encode()):08x}.{os.getpid()}.part")
+    header, compress = header_of(job.tile), target.suffix != ".las"
+    job.tile.check_unchanged()
     try:
-        meant = _copy(job, part, ground_of, compress=target.suffix != ".las")
-        _verify(part, meant)
+        if compress and can_relabel(header, BATCH):
+            meant = _relabel(job, header, part, ground_of)
+        else:
+            meant = _copy(job, header, part, ground_of, compress=compress)
+        job.tile.check_unchanged()
         if job.tile.version == "1.0":
             _set_minor_version(part, 0)
+        crc = crc32_of(part)
         os.replace(part, target)
     except (LaspyException, OSError) as error:
         raise TileError(f"{shown(job.tile.path)} could not be written to {target}: {error}") from error
     finally:
         with suppress(FileNotFoundError):
             part.unlink()
-    return {**meant.record(), "bytes": target.stat().st_size}
+    return {**meant.record(), "bytes": target.stat().st_size, "crc32": crc}
+
+
+def crc32_of(path: Path) -> int:
+    """Return the checksum of a file's bytes."""
+    found = 0
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            found = zlib.crc32(block, found)
+    return found
 
 
 class _Histogram:
@@ -104,44 +122,82 @@ class _Histogram:
         self.points, self.changed, self.crc, self.records = 0, 0, 0, 0
         self.classes = np.zeros(256, np.int64)
 
-    def add(self, classes: npt.NDArray[np.uint8], records: npt.NDArray[Any]) -> None:
+    def add(self, classes: npt.NDArray[np.uint8], records: npt.NDArray[Any] | None = None) -> None:
         self.points += len(classes)
-        self.records = zlib.crc32(np.ascontiguousarray(records).view(np.uint8).data, self.records)
         self.classes += np.bincount(classes, minlength=256)
-        self.crc = zlib.crc32(np.ascontiguousarray(classes).tobytes(), self.crc)
+        self.crc = zlib.crc32(np.ascontiguousarray(classes).data, self.crc)
+        if records is not None:
+            self.records = zlib.crc32(np.ascontiguousarray(records).view(np.uint8).data, self.records)
 
     def record(self) -> dict[str, Any]:
         histogram = {str(k): int(self.classes[k]) for k in np.flatnonzero(self.classes)}
-        return {
-            "points": self.points,
-            "changed": self.changed,
-            "classes": histogram,
-            "crc32": self.crc,
-            "records_crc32": self.records,
-        }
+        return {"points": self.points, "changed": self.changed, "classes": histogram}
+
+    def check(self, part: Path, *, whole: bool) -> None:
+        """Decode a file, its classes or all of it, and refuse it when that is not what was meant."""
+        try:
+            found = _count(part, whole=whole)
+        except TileError as error:
+            raise _not_as_written(part, str(error)) from error
+        if (found.points, found.crc, found.records) != (self.points, self.crc, self.records):
+            raise _not_as_written(part, f"{found.points} of {self.points} points")
 
 
-def _copy(job: TileJob, part: Path, ground_of: GroundOf, *, compress: bool) -> _Histogram:
-    decoder, meant = Decoder.of(job.tile, job.unit_xy, job.unit_z, job.params.classes, job.params.returns), _Histogram()
+class _Labels:
+    """Gives records their classes and keeps count of them."""
+
+    def __init__(self, job: TileJob, header: Header, ground_of: GroundOf) -> None:
+        self._decoder = Decoder.make(header, (job.unit_xy, job.unit_z), job.params.classes, job.params.returns)
+        self._job, self._ground_of, self.meant = job, ground_of, _Histogram()
+
+    def of(self, records: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+        """Return the classes of the next records of the file."""
+        batch = self._decoder.measure(records, self.meant.points, heights=False)
+        classes = new_classes(batch.classification, batch.eligible, self._ground_of(batch), self._job.params.classes)
+        self.meant.changed += int((classes != batch.classification).sum())
+        self.meant.add(classes)
+        return classes
+
+
+def _relabel(job: TileJob, header: Header, part: Path, ground_of: GroundOf) -> _Histogram:
+    """Replace the layer of classes, then look at what was written: its bytes, and the classes as they decode."""
+    assert header.laszip is not None
+    assert header.laszip.chunk_size is not None
+    labels = _Labels(job, header, ground_of)
+    dtype = np.dtype((np.void, header.record_length))
+    size = BATCH // header.laszip.chunk_size * header.laszip.chunk_size
+    raw = (np.frombuffer(data, dtype) for data in records(job.tile, header, size, PLACES | CLASSES | FLAGS))
+    relabel(job.tile.path, header, part, ((some, labels.of(some)) for some in raw))
     job.tile.check_unchanged()
-    backend = laspy.LazBackend.Lazrs
+    trouble = differs(job.tile.path, header, part)
+    if trouble:
+        raise _not_as_written(part, trouble)
+    labels.meant.check(part, whole=False)
+    return labels.meant
+
+
+def _copy(job: TileJob, header: Header, part: Path, ground_of: GroundOf, *, compress: bool) -> _Histogram:
+    """Decode and encode everything, decode what was written and compare."""
+    labels, backend = _Labels(job, header, ground_of), laspy.LazBackend.Lazrs
+    meant = labels.meant
     with _opened(job.tile.path) as file, laspy.open(file, closefd=False, laz_backend=backend) as source:
-        header = plain_header(source.header)
-        with laspy.open(part, "w", header=header, laz_backend=backend, do_compress=compress) as out:
+        plain = plain_header(source.header)
+        with laspy.open(part, "w", header=plain, laz_backend=backend, do_compress=compress) as out:
             for points in source.chunk_iterator(BATCH):
-                batch = decoder.measure(points.array, meant.points)
-                classes = new_classes(batch.classification, batch.eligible, ground_of(batch), job.params.classes)
-                meant.changed += int((classes != batch.classification).sum())
-                points.classification = classes
+                points.classification = labels.of(points.array)
                 out.write_points(points)
-                meant.add(classes, points.array)
+                meant.records = zlib.crc32(np.ascontiguousarray(points.array).view(np.uint8).data, meant.records)
             evlrs = [v for v in source.evlrs or [] if v.user_id != "copc"]
             if evlrs:
                 out.write_evlrs(laspy.vlrs.vlrlist.VLRList(evlrs))
-    job.tile.check_unchanged()
     if meant.points != job.tile.point_count:
         raise TileError(f"{shown(job.tile.path)} holds {meant.points} points, its header says {job.tile.point_count}")
+    meant.check(part, whole=True)
     return meant
+
+
+def _not_as_written(part: Path, why: str) -> TileError:
+    return TileError(f"{part} does not read back as written ({why}); check the disk and run again")
 
 
 class _AsVersion11(io.FileIO):
@@ -179,36 +235,34 @@ def plain_header(header: laspy.LasHeader) -> laspy.LasHeader:
 
 
 def class_counts(path: Path) -> dict[str, Any]:
-    """Count points and classes of a written file again: the checksums among them as in its record.
+    """Count points and classes of a written file again, as in its record.
 
     Raises
     ------
     TileError
         When it cannot be decoded.
     """
+    return _count(path, whole=False).record()
+
+
+def _count(path: Path, *, whole: bool) -> _Histogram:
+    """Decode a written file: its classes, or all of its records."""
+    found, chosen = _Histogram(), laspy.DecompressionSelection.all()
+    if not whole:
+        chosen = laspy.DecompressionSelection.base() | laspy.DecompressionSelection.CLASSIFICATION
+    backend = laspy.LazBackend.Lazrs
     try:
-        return _count(path).record()
+        with (
+            _opened(path) as file,
+            laspy.open(file, closefd=False, laz_backend=backend, decompression_selection=chosen) as reader,
+        ):
+            for points in reader.chunk_iterator(BATCH):
+                found.add(np.asarray(points.classification, np.uint8), points.array if whole else None)
     except (KeyboardInterrupt, SystemExit):
         raise
     # The decompressor may panic on a broken stream, which is not an Exception.
     except BaseException as error:
         raise TileError(f"{shown(str(path))} cannot be decoded: {error}") from None
-
-
-def _verify(part: Path, meant: _Histogram) -> None:
-    found = _count(part)
-    if (found.points, found.crc, found.records) != (meant.points, meant.crc, meant.records):
-        raise TileError(
-            f"{part} does not read back as written ({found.points} of {meant.points} points); "
-            "check the disk and run again"
-        )
-
-
-def _count(path: Path) -> _Histogram:
-    found = _Histogram()
-    with _opened(path) as file, laspy.open(file, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
-        for points in reader.chunk_iterator(BATCH):
-            found.add(np.asarray(points.classification, np.uint8), points.array)
     return found
 
 

@@ -6,7 +6,6 @@ millimetres in integer arithmetic, so that files with different scales and offse
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -21,6 +20,7 @@ from ppdf_dask.crs import unit_fraction
 from ppdf_dask.errors import TileError
 from ppdf_dask.filters.cloud import to_grid
 from ppdf_dask.lasheader import Header, Laszip, Reject, read_header
+from ppdf_dask.layers import chunks
 from ppdf_dask.params import ClassRules
 from ppdf_dask.tiles import Tile, shown
 
@@ -28,6 +28,9 @@ Ints = npt.NDArray[np.int64]
 
 BATCH = 1_000_000
 """Points decoded at once by default: about 100 MB at the peak."""
+
+PLACES, HEIGHTS, CLASSES, FLAGS = 0, 1, 2, 4
+"""Layers of formats 6 to 10 to decode, by the bits of LASzip's selective decompression; x, y and returns always are."""
 
 _INT64 = 2**62
 
@@ -41,7 +44,7 @@ class Batch:
     start : int
         Index of the first point in the file.
     x, y, z : ndarray of int64, shape (n,)
-        Absolute millimetres on the job grid.
+        Absolute millimetres on the job grid; z is empty where heights were not asked for.
     eligible, fixed : ndarray of bool, shape (n,)
         Seen by the filter; ground from the start (mode ``"refine"``).
     classification : ndarray of uint8, shape (n,)
@@ -102,10 +105,10 @@ def batches(
         says; the message names the file and the point.
     """
     tile.check_unchanged()
-    header = _header(tile)
+    header = header_of(tile)
     decoder = Decoder.make(header, (unit_xy, unit_z), rules, returns)
     start = 0
-    for raw in _records(tile, header, size):
+    for raw in records(tile, header, size, PLACES | HEIGHTS | CLASSES | FLAGS):
         batch = decoder.measure(np.frombuffer(raw, decoder.dtype), start)
         yield batch
         start += batch.n
@@ -151,9 +154,9 @@ class Decoder:
         cls, tile: Tile, unit_xy: float, unit_z: float, rules: ClassRules, returns: Literal["last", "all"]
     ) -> Decoder:
         """Make the decoder of a tile; raises TileError when its header is no longer readable."""
-        return cls.make(_header(tile), (unit_xy, unit_z), rules, returns)
+        return cls.make(header_of(tile), (unit_xy, unit_z), rules, returns)
 
-    def measure(self, records: npt.NDArray[Any], start: int) -> Batch:
+    def measure(self, records: npt.NDArray[Any], start: int, *, heights: bool = True) -> Batch:
         """Measure consecutive records.
 
         Parameters
@@ -162,6 +165,8 @@ class Decoder:
             Packed records, any structured type of the header's record length.
         start : int
             Index of the first one in the file.
+        heights : bool
+            Whether z is needed.
 
         Returns
         -------
@@ -173,7 +178,8 @@ class Decoder:
         seen = eligible(dims, self.rules, self.returns, self.header.point_format)
         classes = dims.classification.copy()
         none, odd = odd_returns(dims)
-        x, y, z = (axis.to_mm(points[name]) for axis, name in zip(self.axes, "XYZ", strict=True))
+        x, y = self.axes[0].to_mm(points["X"]), self.axes[1].to_mm(points["Y"])
+        z = self.axes[2].to_mm(points["Z"] if heights else points["Z"][:0])
         return Batch(start, x, y, z, seen, fixed_ground(classes, seen, self.rules), classes, none, odd)
 
 
@@ -235,7 +241,8 @@ class GridAxis:
         return whole
 
 
-def _header(tile: Tile) -> Header:
+def header_of(tile: Tile) -> Header:
+    """Read a tile's header again; raises TileError when it is no longer readable."""
     try:
         return read_header(tile.path)
     except Reject as reject:
@@ -252,8 +259,26 @@ def _record_dtype(header: Header) -> np.dtype[Any]:
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": header.record_length})
 
 
-def _records(tile: Tile, header: Header, size: int) -> Iterator[bytearray]:
-    """Yield the packed records of up to `size` points at a time."""
+def records(tile: Tile, header: Header, size: int, wanted: int) -> Iterator[bytearray]:
+    """Yield the packed records of up to `size` points at a time.
+
+    Parameters
+    ----------
+    tile : Tile
+        As scanned.
+    header : Header
+        Of the same file, just read.
+    size : int
+        Points at a time.
+    wanted : int
+        The sum of `PLACES`, `HEIGHTS`, `CLASSES` and `FLAGS` as needed: which layers of formats 6 to 10 are decoded;
+        what is not may hold anything.
+
+    Raises
+    ------
+    TileError
+        As `batches`.
+    """
     if header.point_count != tile.point_count or header.size != tile.size:
         raise TileError(f"{shown(tile.path)} changed since the scan; scan again and start a new run")
     if header.point_count == 0:
@@ -261,7 +286,7 @@ def _records(tile: Tile, header: Header, size: int) -> Iterator[bytearray]:
     with open(tile.path, "rb") as file:
         if header.laszip is not None:
             _check_chunks(tile, file, header, header.laszip)
-            read = _decompressor(tile, file, header, header.laszip)
+            read = _decompressor(tile, file, header, header.laszip, wanted)
         else:
             file.seek(header.offset_to_points)
             read = file.readinto
@@ -292,15 +317,9 @@ def _decode(tile: Tile, read: Any, buffer: bytearray, start: int, n: int) -> int
     return None if got is None else int(got)
 
 
-def _decompressor(tile: Tile, file: BinaryIO, header: Header, laszip: Laszip) -> Any:
+def _decompressor(tile: Tile, file: BinaryIO, header: Header, laszip: Laszip, wanted: int) -> Any:
     import lazrs
 
-    wanted = (
-        lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL
-        | lazrs.SELECTIVE_DECOMPRESS_Z
-        | lazrs.SELECTIVE_DECOMPRESS_CLASSIFICATION
-        | lazrs.SELECTIVE_DECOMPRESS_FLAGS
-    )
     file.seek(header.offset_to_points)
 
     made: list[Any] = []
@@ -319,23 +338,8 @@ def _check_chunks(tile: Tile, file: BinaryIO, header: Header, laszip: Laszip) ->
     """
     if not laszip.layered:
         return
-    head = struct.Struct(f"<I{laszip.layers}I")
-    position, points = header.offset_to_points + 8, 0
-    for chunk in range(laszip.chunks):
-        if position == laszip.table:
-            break
-        file.seek(position + header.record_length)
-        data = file.read(head.size)
-        if position + header.record_length + head.size > laszip.table or len(data) < head.size:
-            raise TileError(f"{shown(tile.path)} is corrupt at byte {position}: chunk {chunk} is cut off; get it anew")
-        count, *layers = head.unpack(data)
-        position += header.record_length + head.size + sum(layers)
-        points += count
-        if position > laszip.table:
-            raise TileError(
-                f"{shown(tile.path)} is corrupt: chunk {chunk} claims to reach byte {position}, beyond the end of the "
-                f"points at byte {laszip.table}; get it anew"
-            )
+    walk = chunks(file, laszip, header.record_length, header.offset_to_points + 8, shown(tile.path))
+    points = sum(chunk.points for chunk in walk)
     if points != header.point_count:
         raise TileError(
             f"{shown(tile.path)} holds {points} points but its header says {header.point_count}; get it anew"

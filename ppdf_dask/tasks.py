@@ -21,7 +21,7 @@ from typing import Any
 from ppdf_dask import raster
 from ppdf_dask.errors import DiskFullError
 from ppdf_dask.ledger import Ledger
-from ppdf_dask.merge import MergeJob, write_tile
+from ppdf_dask.merge import MergeJob, crc32_of, write_tile
 from ppdf_dask.mosaic import open_dtm, write_cog
 from ppdf_dask.raster import RasterJob
 from ppdf_dask.solve import ClassifyJob, solve
@@ -147,12 +147,3 @@ def export(url: str, target: str, fingerprint: str) -> dict[str, Any]:
     record = {"status": "done", "bytes": path.stat().st_size, "crc32": crc32_of(path), **clock.stamp()}
     Ledger(store).publish("cog", path.name, fingerprint, record)
     return record
-
-
-def crc32_of(path: Path) -> int:
-    """Return the checksum of a file's bytes."""
-    found = 0
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            found = zlib.crc32(block, found)
-    return found

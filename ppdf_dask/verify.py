@@ -19,14 +19,13 @@ from ppdf_dask.dtm import BLOCK
 from ppdf_dask.errors import DamagedError, TileError
 from ppdf_dask.ledger import Ledger, digest
 from ppdf_dask.lock import holder
-from ppdf_dask.merge import class_counts
+from ppdf_dask.merge import class_counts, crc32_of
 from ppdf_dask.objects import LEFTOVER
 from ppdf_dask.raster import checksum
 from ppdf_dask.repair import leftovers, maker, note
 from ppdf_dask.saved import load_plan
 from ppdf_dask.stages import Cutting, Inputs, Records
 from ppdf_dask.store import RunStore, record_path
-from ppdf_dask.tasks import crc32_of
 
 Kind = Literal["missing", "torn", "flipped", "foreign", "orphaned"]
 
@@ -197,9 +196,9 @@ class _Check:
             except (TileError, OSError) as error:
                 self._file("torn", path, f"cannot be read: {error}", f"merge/{source}")
                 continue
-            same = all(found[k] == record[k] for k in ("points", "classes", "records_crc32"))
-            if not same or path.stat().st_size != record["bytes"]:
-                self._file("flipped", path, "has other points or classes than were written", f"merge/{source}")
+            same = all(found[k] == record[k] for k in ("points", "classes"))
+            if not same or crc32_of(path) != record["crc32"]:
+                self._file("flipped", path, "has other bytes than were written", f"merge/{source}")
                 continue
             self.report.counts["points"] += found["points"]
             for name, n in found["classes"].items():

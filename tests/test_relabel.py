@@ -1,0 +1,122 @@
+"""New classes by replacing one layer: the bytes of a full rewrite, every other byte of the source, damage is seen."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+from lasfiles import LEGACY_COUNT, patch, points, write
+
+from ppdf_dask import merge
+from ppdf_dask.errors import TileError
+from ppdf_dask.grid import ChunkGrid
+from ppdf_dask.lasheader import read_header
+from ppdf_dask.layers import chunks
+from ppdf_dask.params import RunParams
+from ppdf_dask.relabel import can_relabel
+from ppdf_dask.survey import scan
+from ppdf_dask.tiler import TileJob
+
+N = 120_000
+"""Points of three chunks."""
+
+
+def source(path, point_format=7, **dims):
+    """Write returns, channels, classes and flags that change from point to point, and an EVLR."""
+    rng = np.random.default_rng(3)
+    returns = rng.integers(1, 6, N)
+    write(
+        path,
+        points(N),
+        point_format=point_format,
+        return_number=np.minimum(returns, rng.integers(1, 6, N)),
+        number_of_returns=returns,
+        scanner_channel=rng.integers(0, 4, N),
+        classification=rng.choice([1, 2, 5, 7, 20], N),
+        edge_of_flight_line=rng.random(N) < 0.01,
+        intensity=rng.integers(0, 65536, N),
+        gps_time=np.cumsum(rng.random(N)),
+        **dims,
+    )
+    las = laspy.read(path)
+    las.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("somebody", 4712, "EVLR", rng.bytes(1000))])
+    las.write(path, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
+    return path
+
+
+def every_third(batch):
+    return (np.arange(batch.start, batch.start + batch.n) % 3 == 0) & batch.eligible
+
+
+def job_of(path):
+    survey = scan([path], assume_units="m")
+    return TileJob("s_000000", survey.tiles[0], 1.0, 1.0, RunParams(), ChunkGrid(1_000_000), 0)
+
+
+@pytest.mark.parametrize("point_format", [6, 8])
+def test_one_new_layer_gives_the_bytes_of_a_full_rewrite(tmp_path, monkeypatch, point_format):
+    job = job_of(source(tmp_path / "a.laz", point_format))
+    assert can_relabel(read_header(job.tile.path), merge.BATCH)
+    quick = merge.rewrite(job, tmp_path / "quick.laz", every_third)
+    monkeypatch.setattr(merge, "can_relabel", lambda header, most: False)
+    full = merge.rewrite(job, tmp_path / "full.laz", every_third)
+    assert quick == full
+    assert 0 < quick["changed"] < N
+    header = read_header(job.tile.path)
+    old, new, slow = (
+        (tmp_path / name).read_bytes()[header.offset_to_points :] for name in ("a.laz", "quick.laz", "full.laz")
+    )
+    assert new == slow
+    assert new != old
+
+
+def test_batches_end_with_chunks(tmp_path, monkeypatch):
+    job = job_of(source(tmp_path / "a.laz"))
+    merge.rewrite(job, tmp_path / "one.laz", every_third)
+    monkeypatch.setattr(merge, "BATCH", 60_000)
+    merge.rewrite(job, tmp_path / "three.laz", every_third)
+    assert (tmp_path / "one.laz").read_bytes() == (tmp_path / "three.laz").read_bytes()
+
+
+def places(path):
+    """Return a byte of every kind: a header field, z and the classes of the second chunk, the EVLR."""
+    header = read_header(str(path))
+    with path.open("rb") as file:
+        _, second, _ = chunks(file, header.laszip, header.record_length, header.offset_to_points + 8, "a")
+    begin, end = second.classes
+    z = second.position + second.head + second.layers[0] + 7
+    return {"header": 90, "z": z, "classes": second.position + (begin + end) // 2, "evlr": header.evlrs[1] - 3}
+
+
+@pytest.mark.parametrize("what", ["header", "z", "classes", "evlr"])
+def test_a_byte_that_is_not_as_written_is_seen(tmp_path, monkeypatch, what):
+    job, write_new = job_of(source(tmp_path / "a.laz")), merge.relabel
+
+    def careless(path, header, part, labelled):
+        write_new(path, header, part, labelled)
+        data = bytearray(part.read_bytes())
+        data[places(part)[what]] ^= 0x10
+        part.write_bytes(data)
+
+    monkeypatch.setattr(merge, "relabel", careless)
+    with pytest.raises(TileError, match="does not read back as written"):
+        merge.rewrite(job, tmp_path / "b.laz", every_third)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.laz"]
+
+
+def test_untidy_files_are_written_in_full(tmp_path):
+    path = patch(source(tmp_path / "a.laz"), LEGACY_COUNT, "I", 7)
+    header = read_header(str(path))
+    assert [code for code, _ in header.warnings] == ["legacy-count"]
+    assert not can_relabel(header, merge.BATCH)
+    merge.rewrite(job_of(path), tmp_path / "b.laz", every_third)
+    assert laspy.read(tmp_path / "b.laz").header.point_count == N
+    assert read_header(str(tmp_path / "b.laz")).warnings == ()
+
+
+def test_other_formats_and_large_chunks_are_written_in_full(tmp_path):
+    layered = read_header(str(source(tmp_path / "a.laz")))
+    assert can_relabel(layered, 50_000)
+    assert not can_relabel(layered, 49_999)
+    assert not can_relabel(read_header(str(write(tmp_path / "old.laz", point_format=1))), merge.BATCH)
+    assert not can_relabel(read_header(str(write(tmp_path / "plain.las"))), merge.BATCH)
