@@ -155,11 +155,11 @@ def _around(vertices, triangles, v, t, x, y, best, best_v, best_t):  # type: ign
             i = 0
             while triangles[u, i] != v:
                 i += 1
-            for k in (1, 2):
-                w = triangles[u, (i + k) % 3]
-                d = _squared(2 * np.int64(vertices[w, 0]), 2 * np.int64(vertices[w, 1]), x, y)
-                if d < best:
-                    best, best_v, best_t = d, w, u
+            # The neighbour on the edge that is crossed next: so each one is looked at once.
+            w = triangles[u, (i + 3 - way) % 3]
+            d = _squared(2 * np.int64(vertices[w, 0]), 2 * np.int64(vertices[w, 1]), x, y)
+            if d < best:
+                best, best_v, best_t = d, w, u
             u = triangles[u, 3 + (i + way) % 3]
             if u == t:
                 return best, best_v, best_t

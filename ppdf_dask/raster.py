@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ppdf_dask.dtm import BLOCK, Block, Raster, rasterize_block
-from ppdf_dask.grid import MM, Rect
+from ppdf_dask.grid import MM, Chunk, Rect
 from ppdf_dask.index import owns_points
 from ppdf_dask.mosaic import raster_attributes, spatial_ref
-from ppdf_dask.neighbourhood import Cut
+from ppdf_dask.neighbourhood import KEPT_POINTS, Cut, inside
 from ppdf_dask.params import DtmParams
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import Survey
@@ -78,20 +78,8 @@ def jobs(raster: Raster, ground: dict[Rect, int], params: DtmParams) -> Iterator
 
 def rasterize(store: RunStore, job: RasterJob, into: RunStore | None = None) -> dict[str, Any]:
     """Compute one block and write its shards, into another store if one is given (`debug`)."""
-    into = into or store
-
-    def load(rect: Rect) -> npt.NDArray[np.int64]:
-        parts = [np.empty((0, 3), np.int64)]
-        for chunk in job.cut.grid.over(_clip(rect, job.cut.extent)):
-            if not owns_points(store, chunk.id):
-                continue
-            points = store.read_ground(chunk.id).astype(np.int64)
-            points[0] += chunk.core.x0
-            points[1] += chunk.core.y0
-            parts.append(points.T)
-        return np.concatenate(parts)
-
-    found = rasterize_block(job.block, load, job.params, extent=job.cut.extent, unit_z=job.unit_z)
+    into, ground = into or store, _Ground(store, job.cut)
+    found = rasterize_block(job.block, ground.inside, job.params, extent=job.cut.extent, unit_z=job.unit_z)
     row, column = job.block.row - job.raster.row, job.block.col - job.raster.col
     into.write_block("height", row, column, found.height)
     into.write_block("distance", row, column, found.distance)
@@ -106,6 +94,36 @@ def rasterize(store: RunStore, job: RasterJob, into: RunStore | None = None) -> 
         "ground_read": found.points,
         "margin_m": found.margin / MM,
     }
+
+
+class _Ground:
+    """The ground points around a block, each chunk's decoded once as long as `KEPT_POINTS` allow."""
+
+    def __init__(self, store: RunStore, cut: Cut) -> None:
+        self._store, self._cut = store, cut
+        self._kept: dict[str, npt.NDArray[np.int32]] = {}
+
+    def inside(self, rect: Rect) -> npt.NDArray[np.int64]:
+        """Return the points inside a rectangle: absolute, mm, (n, 3)."""
+        parts = [np.empty((3, 0), np.int64)]
+        for chunk in self._cut.grid.over(_clip(rect, self._cut.extent)):
+            points, home = self._of(chunk), chunk.core
+            # Cropped before it is widened: a margin takes a strip of a chunk.
+            near: npt.NDArray[np.int64] = points[:, inside(points, home, rect)].astype(np.int64)
+            near[0] += home.x0
+            near[1] += home.y0
+            parts.append(near)
+        return np.concatenate(parts, axis=1).T
+
+    def _of(self, chunk: Chunk) -> npt.NDArray[np.int32]:
+        if chunk.id not in self._kept:
+            found = np.empty((3, 0), np.int32)
+            if owns_points(self._store, chunk.id):
+                found = self._store.read_ground(chunk.id)
+            while self._kept and sum(p.shape[1] for p in self._kept.values()) + found.shape[1] > KEPT_POINTS:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[chunk.id] = found
+        return self._kept[chunk.id]
 
 
 def checksum(layers: list[npt.NDArray[np.float32]]) -> int:
