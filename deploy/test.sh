@@ -12,6 +12,7 @@ command -v slurmctld > /dev/null && command -v ip > /dev/null || {
 PPDF_DASK_SCHEMAS=${PPDF_DASK_SCHEMAS:-$(mktemp -d)}
 export PPDF_DASK_SCHEMAS
 [ -d "$PPDF_DASK_SCHEMAS/compose" ] ||
-  "$python" -m pip install -q --no-deps --target "$PPDF_DASK_SCHEMAS" dask-kubernetes docker-compose
+  "$python" -m pip install -q --no-deps --target "$PPDF_DASK_SCHEMAS" dask-kubernetes docker-compose \
+    kubernetes-validate importlib-resources
 "$python" -m pytest -m "slow or not slow" --durations=10 \
   tests/test_deploy.py tests/test_deploy_slurm.py tests/test_deploy_hosts.py

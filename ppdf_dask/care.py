@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from ppdf_dask import tasks
-from ppdf_dask.errors import DamagedError, ParameterError
+from ppdf_dask.errors import DamagedError, ParameterError, StoreError
 from ppdf_dask.ledger import STAGES, Ledger
+from ppdf_dask.ledger import Stage as StageName
 from ppdf_dask.lock import holder
 from ppdf_dask.quarantine import read_failures
 from ppdf_dask.raster import rasterize
@@ -17,6 +18,7 @@ from ppdf_dask.saved import load_plan
 from ppdf_dask.solve import solve
 from ppdf_dask.stages import Cutting, Inputs
 from ppdf_dask.store import RunStore
+from ppdf_dask.submit import Submission
 from ppdf_dask.tiler import cut
 
 
@@ -32,18 +34,23 @@ def status(out: str | Path) -> dict[str, Any]:
     -------
     dict
         ``stages`` (name to ``tasks``, None where not known yet, and ``done``), ``running`` (who works there, or None),
-        ``failures`` and ``waiting`` as in ``failures.json``, ``finished``.
+        ``submitted`` (the state of a run that lives in a cluster, see `Submission.state`, or None), ``failures`` and
+        ``waiting`` as in ``failures.json``, ``finished``.
 
     Raises
     ------
     StoreError
         When there is no run.
     """
-    plan = load_plan(out)
-    store = RunStore(str(plan.out / "run.zarr"))
-    inputs, ledger = Inputs(plan), Ledger(store)
+    sent = _submitted(out)
     done = dict.fromkeys(STAGES, 0)
-    known: dict[str, int | None] = dict.fromkeys(STAGES)
+    known: dict[StageName, int | None] = dict.fromkeys(STAGES)
+    store = RunStore(str(Path(out) / "run.zarr"))
+    if sent is not None and not store.exists():
+        known["tile"] = sum(t.point_count > 0 for t in sent.plan().survey.tiles)
+        return _answer(known, done, sent, None, {"failures": [], "waiting": []}, False)
+    plan = load_plan(out)
+    inputs, ledger = Inputs(plan), Ledger(store)
     tiles = ledger.done("tile", inputs.tile_keys)
     known["tile"], done["tile"] = len(inputs.sources), len(tiles)
     cutting = Cutting(inputs, store, tiles)
@@ -64,11 +71,30 @@ def status(out: str | Path) -> dict[str, Any]:
             known["dtm"], done["dtm"] = len(blocks[0]) + len(blocks[1]), len(found)
             export = cutting.cog_work(blocks[0], blocks[1])
             known["cog"], done["cog"] = 1, len(ledger.done("cog", {"dtm.tif": export.fingerprint}))
+    return _answer(known, done, sent, holder(store), lost, (plan.out / "run.json").is_file())
+
+
+def _submitted(out: str | Path) -> Submission | None:
+    try:
+        return Submission(out)
+    except StoreError:
+        return None
+
+
+def _answer(
+    known: dict[StageName, int | None],
+    done: dict[StageName, int],
+    sent: Submission | None,
+    running: str | None,
+    lost: dict[str, Any],
+    finished: bool,
+) -> dict[str, Any]:
     return {
         "stages": {stage: {"tasks": known[stage], "done": done[stage]} for stage in STAGES},
-        "running": holder(store),
+        "running": running,
+        "submitted": None if sent is None else sent.state(),
         **lost,
-        "finished": (plan.out / "run.json").is_file(),
+        "finished": finished,
     }
 
 

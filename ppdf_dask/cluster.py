@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from ppdf_dask.errors import ClusterError
 
@@ -187,25 +187,35 @@ def scheduler_file(path: str) -> str:
 
 
 def dashboard(client: Client, environ: Mapping[str, str] = os.environ) -> list[str]:
-    """Return where the dashboard is, in lines to show.
+    """Return where a client's dashboard is, in lines to show; see `dashboard_lines`."""
+    return dashboard_lines(client.dashboard_link, environ)
+
+
+def dashboard_lines(link: str, environ: Mapping[str, str] = os.environ) -> list[str]:
+    """Return where a dashboard is, in lines to show.
 
     Parameters
     ----------
-    client : distributed.Client
-        Of the cluster.
+    link : str
+        As Dask tells it, from the scheduler's address; it does not tell on which address the dashboard listens.
     environ : mapping
         ``JUPYTERHUB_SERVICE_PREFIX`` and ``SSH_CONNECTION`` are looked at; default the process's own.
 
     Returns
     -------
     list of str
-        The link as a browser needs it: behind JupyterHub the proxied one, over SSH followed by the tunnel's command.
-        Empty where there is no dashboard.
+        The link as a browser needs it: behind JupyterHub the proxied one, over SSH followed by the tunnel's command. Of
+        a dashboard that other machines cannot reach (it listens on its scheduler's loopback, as it should), the tunnel
+        to that machine. Empty where there is no dashboard.
     """
-    link = client.dashboard_link
     if not link:
         return []
     parts = urlsplit(link)
+    if parts.scheme in ("http", "https") and parts.port and not _is_loopback(link) and not _answers(parts):
+        return [
+            f"dashboard on {parts.hostname} only: ssh -N -L {parts.port}:127.0.0.1:{parts.port} {parts.hostname}, "
+            f"then http://127.0.0.1:{parts.port}/status"
+        ]
     prefix = environ.get("JUPYTERHUB_SERVICE_PREFIX")
     if prefix and parts.scheme in ("http", "https") and parts.port:
         place = str(parts.port) if _is_loopback(link) else f"{parts.hostname}:{parts.port}"
@@ -218,6 +228,15 @@ def dashboard(client: Client, environ: Mapping[str, str] = os.environ) -> list[s
             f"then http://127.0.0.1:{parts.port}/status"
         )
     return lines
+
+
+def _answers(place: SplitResult) -> bool:
+    """Tell whether somebody listens there."""
+    try:
+        with socket.create_connection((place.hostname, place.port), timeout=1.0):
+            return True
+    except OSError:
+        return False
 
 
 def _is_loopback(address: str) -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-State = Literal["started", "done", "failed", "retried", "stage", "finished", "note"]
+State = Literal["started", "stage", "sent", "done", "failed", "retried", "finished"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,8 @@ class Event:
         ``tile``, ``classify``, ``merge``, ``dtm`` or ``run``.
     state : str
         ``stage`` when a stage begins (`total` and `record` hold what is to do, ``record["resumed"]`` the ids done by
-        an earlier run), ``done`` or ``failed`` for one piece of work, ``finished`` at the end.
+        an earlier run), ``sent`` when one piece of work goes to the cluster, ``done``, ``failed`` or ``retried`` when
+        it comes back, ``finished`` at the end.
     ident : str
         Chunk id, source id or block id; empty for whole stages.
     points : int
@@ -28,6 +30,8 @@ class Event:
         Points of the whole stage, for ``stage`` events.
     record : dict
         The work's record, or what is worth telling.
+    time : float
+        Seconds since 1970 when it happened, for rates: who attaches late hears old events at once.
     """
 
     stage: str
@@ -36,6 +40,7 @@ class Event:
     points: int = 0
     total: int = 0
     record: dict[str, Any] = field(default_factory=dict)
+    time: float = field(default_factory=time.time, compare=False)
 
 
 Listener = Callable[[Event], None]

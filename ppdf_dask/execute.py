@@ -103,6 +103,7 @@ class _Flight:
                 self.stage.function, self.stage.url, work.job, work.fingerprint, key=key, pure=False
             )
         self.flying[key] = (work, future)
+        self.on_event(Event(self.stage.name, "sent", work.ident))
         future.add_done_callback(self.arrived.put)
 
     def window(self) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -67,7 +66,7 @@ class TerminalProgress:
         )
         self._task: TaskID | None = None
         self._stage: Event | None = None
-        self._began = 0.0
+        self._began = self._now = 0.0
         self._points = 0
         self._pieces = 0
 
@@ -82,13 +81,14 @@ class TerminalProgress:
 
     def __call__(self, event: Event) -> None:
         """Take one event."""
+        self._now = event.time
         if event.state == "stage":
             self._end_stage()
             self._begin_stage(event)
         elif event.state == "done" and self._task is not None:
             self._points += event.points
             self._pieces += 1
-            note = rate(self._points, time.monotonic() - self._began)
+            note = rate(self._points, self._now - self._began)
             self._bar.update(self._task, advance=event.points, note=note)
         elif event.state == "failed":
             self._console.print(f"{event.stage} {event.ident} failed: {event.record.get('error', '')}", markup=False)
@@ -96,7 +96,7 @@ class TerminalProgress:
             self._end_stage()
 
     def _begin_stage(self, event: Event) -> None:
-        self._stage, self._began = event, time.monotonic()
+        self._stage, self._began = event, event.time
         self._points, self._pieces = 0, event.record.get("done", 0)
         title = TITLES.get(event.stage, event.stage)
         self._task = self._bar.add_task(title, total=max(event.total, 1), completed=event.points, note="")
@@ -106,7 +106,7 @@ class TerminalProgress:
             return
         self._bar.update(self._task, completed=max(self._stage.total, 1))
         if not self._console.is_terminal:
-            seconds = time.monotonic() - self._began
+            seconds = self._now - self._began
             title = TITLES.get(self._stage.stage, self._stage.stage)
             tasks = self._stage.record.get("tasks", 0)
             self._console.print(
@@ -116,7 +116,7 @@ class TerminalProgress:
 
 
 class JsonLog:
-    """Writes each event as one JSON line with the time since 1970, flushed at once.
+    """Writes each event as one JSON line, flushed at once.
 
     Parameters
     ----------
@@ -129,8 +129,8 @@ class JsonLog:
 
     def __call__(self, event: Event) -> None:
         """Take one event."""
-        line = {"time": round(time.time(), 3), **dataclasses.asdict(event)}
-        self._out.write(json.dumps(line, default=str) + "\n")
+        line = dataclasses.asdict(event)
+        self._out.write(json.dumps({"time": round(line.pop("time"), 3), **line}, default=str) + "\n")
         self._out.flush()
 
 

@@ -6,7 +6,7 @@ own is lost; the ledger makes that a resumption, the lock keeps two drivers apar
 
 All that others need lies in ``RUN/driver``::
 
-    request.json   the plan and the options
+    request.json   the plan, the options, the dashboard's link
     state.json     submitted, running, lost, finished, partial, failed or cancelled; who, since when, why
     events.jsonl   every event with its time
     log.txt        the same in words, with tracebacks
@@ -77,6 +77,23 @@ class Submission:
             found = {"state": "submitted"}
         return found
 
+    def status(self) -> dict[str, Any]:
+        """Return what of the run is done, failed and left, from its ledger; see `ppdf_dask.care.status`."""
+        from ppdf_dask.care import status
+
+        return status(self.out)
+
+    def plan(self) -> Plan:
+        """Return the plan that was submitted."""
+        from ppdf_dask.saved import plan_from_dict
+
+        return plan_from_dict(self._request()["plan"], self.out)
+
+    @property
+    def dashboard(self) -> str:
+        """Link of the cluster's dashboard as it was when the run was submitted; see `cluster.dashboard_lines`."""
+        return str(self._request()["dashboard"] or "")
+
     def log(self) -> str:
         """Return the driver's log."""
         with suppress(FileNotFoundError):
@@ -126,6 +143,10 @@ class Submission:
                 )
             time.sleep(_LOOK)
 
+    def _request(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads((self._place / "request.json").read_text(encoding="utf-8"))
+        return found
+
     def _read(self, reader: _Reader) -> Iterator[Event]:
         found = list(reader.events())
         starts = [k for k, event in enumerate(found) if event.state == "started"]
@@ -169,7 +190,8 @@ def submit(plan: Plan, client: Client, *, overwrite: bool = False, accept_change
     place = plan.out / "driver"
     place.mkdir(parents=True, exist_ok=True)
     options = {"overwrite": overwrite, "accept_changes": accept_changes}
-    write_json(place / "request.json", {"plan": plan_as_dict(plan), "options": options})
+    request = {"plan": plan_as_dict(plan), "options": options, "dashboard": client.dashboard_link}
+    write_json(place / "request.json", request)
     (place / "cancel").unlink(missing_ok=True)
     write_json(place / "state.json", {"state": "submitted", "since": _now()})
     # One key per folder: a driver that waits for a worker is not doubled by submitting again.
@@ -309,7 +331,6 @@ class _Reader:
                 # A line torn by a killed driver has the next driver's first line at its end.
                 with suppress(ValueError):
                     values = json.loads(line)
-                    del values["time"]
                     yield Event(**values)
 
 

@@ -15,7 +15,7 @@ from ppdf_dask.progress import TITLES, rate
 if TYPE_CHECKING:
     from ppdf_dask.plan import Plan
 
-STATES = {"waiting": "grey", "tried again": "orange", "done": "green", "failed": "red"}
+STATES = {"waiting": "grey", "in the cluster": "sky", "tried again": "orange", "done": "green", "failed": "red"}
 """State of a piece of work and its colour."""
 
 _BY_TILE = ("tile", "merge")
@@ -66,13 +66,14 @@ class LiveMap:
         self._draw(now=event.state in ("stage", "finished"))
 
     def _one(self, event: Event) -> None:
-        states = {"done": "done", "failed": "failed", "retried": "tried again"}
+        states = {"sent": "in the cluster", "done": "done", "failed": "failed", "retried": "tried again"}
         if event.state not in states:
             return
-        self._states[event.ident] = states[event.state]
+        if event.state != "sent" or self._states.get(event.ident) != "tried again":
+            self._states[event.ident] = states[event.state]
         if event.stage == "classify" and event.ident not in self._chunks:
             self._chunks[event.ident] = self._grid.parse(event.ident).core
-        if event.state != "retried" and event.stage in self._stages:
+        if event.state in ("done", "failed") and event.stage in self._stages:
             self._stages[event.stage].advance(event)
 
     def html(self) -> str:
@@ -121,13 +122,13 @@ class _Bar:
         self._title = TITLES.get(event.stage, event.stage)
         self._total, self._done = max(event.total, 1), event.points
         self._pieces, self._of = event.record.get("done", 0), event.record.get("tasks", 0)
-        self._new, self._began, self._last = 0, time.monotonic(), 0.0
+        self._new, self._began, self._last = 0, event.time, 0.0
 
     def advance(self, event: Event) -> None:
         self._done += event.points
         self._new += event.points
         self._pieces += 1
-        self._last = time.monotonic() - self._began
+        self._last = event.time - self._began
 
     def html(self) -> str:
         share = min(self._done / self._total, 1.0) if self._pieces < self._of else 1.0

@@ -6,9 +6,13 @@ import ast
 import json
 import os
 import re
+import socket
 import stat
 import subprocess
 import sys
+import time
+import urllib.error
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -97,6 +101,17 @@ def test_every_cluster_has_a_network_policy():
     assert closed == {d["metadata"]["name"] for d in found if d["kind"] in ("DaskCluster", "DaskJob")}
 
 
+def test_network_policies_match_kubernetes_own_schema(schemas):
+    pytest.importorskip("jsonschema")
+    policies = str(DEPLOY / "kubernetes/network.yaml")
+    subprocess.run(
+        [sys.executable, "-m", "kubernetes_validate", "--strict", policies],
+        env=os.environ | {"PYTHONPATH": str(schemas)},
+        check=True,
+        capture_output=True,
+    )
+
+
 def test_compose_file_matches_its_schema(schemas):
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads((schemas / "compose/config/compose_spec.json").read_text())
@@ -104,9 +119,10 @@ def test_compose_file_matches_its_schema(schemas):
     assert not list(jsonschema.Draft7Validator(schema).iter_errors(document))
 
 
-def test_compose_publishes_the_dashboard_on_loopback_only():
+def test_compose_publishes_on_loopback_only():
     services = yaml.safe_load((DEPLOY / "docker/compose.yaml").read_text())["services"]
-    assert [port for s in services.values() for port in s.get("ports", [])] == ["127.0.0.1:8787:8787"]
+    published = [port for s in services.values() for port in s.get("ports", [])]
+    assert published == ["127.0.0.1:8787:8787", "127.0.0.1:8888:8888"]
     assert {s["user"] for s in services.values()} == {"10001:10001"}
     assert all(s["read_only"] and s["cap_drop"] == ["ALL"] for s in services.values())
 
@@ -117,28 +133,23 @@ def instructions() -> list[tuple[str, str]]:
     return [(name, rest.strip()) for name, rest in (line.split(" ", 1) for line in lines)]
 
 
-def test_dockerfile_keeps_the_rules_of_hadolint():
+@pytest.mark.skipif(sys.platform != "linux", reason="hadolint comes with the development extra on Linux only")
+def test_hadolint_finds_nothing():
+    linter = str(Path(sys.executable).parent / "hadolint")
+    ran = subprocess.run([linter, str(DEPLOY / "docker/Dockerfile")], capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout) == (0, "")
+
+
+def test_the_image_is_pinned_and_not_root():
     found = instructions()
     bases = [rest for name, rest in found if name == "FROM"]
     assert len(bases) == 2
     for base in bases:
-        assert re.match(r"python:\d+\.\d+\.\d+-slim-\w+( AS \w+)?$", base), "DL3006, DL3007: a base is pinned"
+        assert re.match(r"python:\d+\.\d+\.\d+-slim-\w+( AS \w+)?$", base), "a base is pinned"
     assert bases[0].split(" AS ")[0] == bases[1], "both stages have the same interpreter"
-    users = [rest for name, rest in found if name == "USER"]
-    assert users[-1] == "10001:10001", "DL3002: the last user is not root"
-    for name, rest in found:
-        assert name not in ("ADD", "MAINTAINER"), "DL3020, DL4000"
-        assert name != "WORKDIR" or rest.startswith("/"), "DL3000"
-        if name == "RUN":
-            assert not re.search(r"\b(sudo|ssh|vim|shutdown|service|top|kill)\b", rest), "DL3001, DL3004"
-            assert "cd " not in rest, "DL3003"
-            assert "pip install" not in rest or "--no-cache-dir" in rest, "DL3042"
-            assert "pip install" not in rest or "--constraint" in rest, "DL3013: versions are pinned"
-        if name in ("CMD", "ENTRYPOINT"):
-            assert rest.startswith("["), "DL3025"
-    stages = [rest.split(" AS ")[1] for rest in bases if " AS " in rest]
-    copied = [rest for name, rest in found if name == "COPY" and "--from=" in rest]
-    assert [rest.split()[0] for rest in copied] == [f"--from={stage}" for stage in stages], "DL3022"
+    assert [rest for name, rest in found if name == "USER"][-1] == "10001:10001"
+    installs = [rest for name, rest in found if name == "RUN" and "pip install" in rest]
+    assert all("--constraint constraints.txt" in rest for rest in installs), "what hadolint does not see: versions"
 
 
 def test_what_the_image_copies_is_there_and_let_in():
@@ -151,6 +162,7 @@ def test_what_the_image_copies_is_there_and_let_in():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_the_images_steps_make_a_working_installation(tmp_path):
     """Replay the steps of the first stage in a clean folder and environment, with this interpreter."""
     context, target = tmp_path / "src", tmp_path / "opt"
@@ -164,16 +176,56 @@ def test_the_images_steps_make_a_working_installation(tmp_path):
         elif name == "RUN" and "/opt/ppdf" in rest:
             step = rest.replace("/opt/ppdf", str(target)).replace("python -m venv", f"{sys.executable} -m venv")
             subprocess.run(["sh", "-euc", step], cwd=context, check=True)
-    environment = {
-        "PATH": f"{target}/bin:/usr/bin:/bin",
-        "NUMBA_CACHE_DIR": str(tmp_path / "numba"),
-        "HOME": "/nowhere",
-    }
+    environment = image_environment(tmp_path) | {"PATH": f"{target}/bin:/usr/bin:/bin", "HOME": "/nowhere"}
     said = subprocess.run(
         [f"{target}/bin/ppdf-dask", "doctor", "--json"], env=environment, capture_output=True, check=True, cwd=tmp_path
     )
     assert json.loads(said.stdout)["versions"]["ppdf-dask"]
     subprocess.run([f"{target}/bin/dask", "scheduler", "--help"], env=environment, check=True, capture_output=True)
+    the_notebook_answers(Path(target), environment, tmp_path)
+
+
+def image_environment(tmp_path: Path) -> dict[str, str]:
+    """Return the image's variables with its /tmp here."""
+    (variables,) = (rest for name, rest in instructions() if name == "ENV")
+    pairs = (pair.split("=", 1) for pair in variables.split())
+    return {name: value.replace("/tmp", str(tmp_path / "tmp")) for name, value in pairs if name != "PATH"}
+
+
+def the_notebook_answers(target: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    """Start the notebook as compose.yaml does: it wants the token, and does not write it down."""
+    notebook = yaml.safe_load((DEPLOY / "docker/compose.yaml").read_text())["services"]["notebook"]
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    options = [o.replace("8888", str(port)).replace("0.0.0.0", "127.0.0.1") for o in notebook["command"][1:]]
+    log = tmp_path / "notebook.log"
+    command = [f"{target}/bin/{notebook['command'][0]}", *(o.replace("/data", "/tmp") for o in options)]
+    with log.open("wb") as out:
+        # Jupyter refuses to be root unless told so; in the image it is not.
+        server = subprocess.Popen([*command, "--allow-root"], stdout=out, stderr=out,
+                                  env=environment | {"JUPYTER_TOKEN": "word-of-ann"})  # fmt: skip
+    try:
+        page, end = f"http://127.0.0.1:{port}/api/contents", time.monotonic() + 120
+        while (code := answer(page)) == 0:
+            assert time.monotonic() < end, log.read_text()
+            time.sleep(0.5)
+        assert (code, answer(f"{page}?token=word-of-ann")) == (403, 200)
+    finally:
+        server.terminate()
+        server.wait()
+    assert "word-of-ann" not in log.read_text()
+
+
+def answer(page: str) -> int:
+    """Return the HTTP code of a page, 0 when nobody answers."""
+    try:
+        with urllib.request.urlopen(page, timeout=30) as found:
+            return int(found.status)
+    except urllib.error.HTTPError as refused:
+        return refused.code
+    except OSError:
+        return 0
 
 
 def test_certificates_are_private(tmp_path):

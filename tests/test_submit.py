@@ -6,6 +6,8 @@ import hashlib
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -185,3 +187,70 @@ def test_a_run_with_faults_says_what_and_keeps_the_rest(small_survey, cluster, t
         end = made.submit(client).follow(lambda _: None)
     assert (end["state"], end["exit_code"]) == ("partial", 3)
     assert bad.name in end["error"]
+
+
+def test_a_run_that_no_worker_took_up_yet_has_a_status(small_survey, cluster, tmp_path):
+    made = small(small_survey, tmp_path / "run")
+    with Client(cluster.scheduler_address) as client:
+        submission = made.submit(client)
+        assert submission.dashboard == client.dashboard_link
+    (tmp_path / "copy" / "driver").mkdir(parents=True)
+    request = (tmp_path / "run" / "driver" / "request.json").read_text()
+    (tmp_path / "copy" / "driver" / "request.json").write_text(request)
+    waiting = Submission(tmp_path / "copy").status()
+    assert waiting["stages"]["tile"] == {"tasks": 9, "done": 0}
+    assert waiting["submitted"] == {"state": "submitted"}
+    submission.follow(lambda _: None)
+    found = submission.status()
+    assert found["stages"]["tile"] == {"tasks": 9, "done": 9}
+    assert (found["submitted"]["state"], found["finished"]) == ("finished", True)
+    said = CliRunner().invoke(group, ["status", str(tmp_path / "copy")]).stdout
+    assert "submitted  submitted" in said
+
+
+class Cluster:
+    """A scheduler and a worker as processes of their own."""
+
+    def __init__(self, folder: Path, environment: dict[str, str] | None = None) -> None:
+        self.file, self.folder = folder / "scheduler.json", folder
+        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", self.file)
+        wait_for(lambda: self.file.is_file() and self.file.stat().st_size)
+        self.worker = self._start("worker", "--scheduler-file", self.file, "--nthreads", "1", "--no-nanny",
+                                  "--memory-limit", "3GiB", "--local-directory", folder / "space")  # fmt: skip
+
+    def _start(self, part: str, *options: object) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{part}", *map(str, options)]
+        with (self.folder / f"{part}.log").open("ab") as log:
+            return subprocess.Popen([*command, "--dashboard-address", "127.0.0.1:0"], stdout=log, stderr=log)
+
+    def end(self) -> None:
+        for process in (self.worker, self.scheduler):
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.slow
+def test_a_lost_scheduler_and_the_same_command_on_another(small_survey, tmp_path, reference, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = ["submit", str(small_survey / "tiles"), "--out", "run", "--scheduler", "scheduler.json"]
+    command += ["--chunk-size", "40"]
+    first = Cluster(tmp_path)
+    try:
+        assert CliRunner().invoke(group, command, catch_exceptions=False).exit_code == 0
+        submission = Submission("run")
+        wait_for(lambda: any(e.stage == "classify" and e.state == "done" for e in submission.events()))
+        first.scheduler.kill()
+        with pytest.raises(ClusterError, match="same submit command"):
+            submission.follow(lambda _: None, patience=5.0)
+        assert "the scheduler at" in submission.log()
+    finally:
+        first.end()
+    (tmp_path / "scheduler.json").unlink()
+    second = Cluster(tmp_path)
+    try:
+        assert CliRunner().invoke(group, command, catch_exceptions=False).exit_code == 0
+        assert Submission("run").follow(lambda _: None)["state"] == "finished"
+    finally:
+        second.end()
+    assert next(e for e in Submission("run").events() if e.stage == "classify").record["done"] > 0
+    assert digests(tmp_path / "run") == reference

@@ -52,7 +52,11 @@ def main() -> None:
         scheduler_options={"dashboard_address": "127.0.0.1:0"},
         job_script_prologue=[f"export {name}={value}" for name, value in SINGLE.items()],
         # A worker leaves before its job is killed, so that nothing is blamed for it.
-        worker_extra_args=["--lifetime", f"{max(options.minutes - 3, 1)}m", "--lifetime-stagger", "1m"],
+        worker_extra_args=[
+            *("--lifetime", f"{max(options.minutes - 3, 1)}m", "--lifetime-stagger", "1m"),
+            # Also without a dashboard a worker answers HTTP, on all addresses unless told where.
+            *("--dashboard-address", "127.0.0.1:0"),
+        ],
     )
     console = Console(stderr=True)
     try:

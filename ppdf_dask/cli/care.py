@@ -32,11 +32,17 @@ def status(run: Path, as_json: bool) -> None:
     for name, s in found["stages"].items():
         click.echo(f"{name:<10} {s['done']:>8} of {s['tasks'] if s['tasks'] is not None else '?'} done")
     click.echo(f"running    {found['running'] or 'nobody'}")
+    if sent := found["submitted"]:
+        click.echo(f"submitted  {sent['state']} since {sent.get('since', '?')}" + _reason(sent))
     for f in found["failures"][:10]:
         click.echo(f"failed     {f['stage']} {f['id']} ({f['what']}): {f['error']}")
     if found["waiting"]:
         click.echo(f"waiting    {len(found['waiting'])} pieces for those that failed")
     click.echo(f"finished   {'yes' if found['finished'] else 'no'}")
+
+
+def _reason(sent: dict[str, Any]) -> str:
+    return f": {sent['error']}" if sent.get("error") else ""
 
 
 @click.command()

@@ -62,13 +62,16 @@ def attach(run: Path, quiet: bool) -> None:
     """
     from rich.console import Console
 
+    from ppdf_dask.cluster import dashboard_lines
     from ppdf_dask.progress import listen
-    from ppdf_dask.submit import Submission
+    from ppdf_dask.submit import ENDED, Submission
 
     submission = Submission(run)
     state = submission.state()
     if not quiet:
         click.echo(f"{run}: {state['state']} since {state.get('since', '?')}", err=True)
+        for line in dashboard_lines(submission.dashboard) if state["state"] not in ENDED else ():
+            click.echo(line, err=True)
     try:
         with listen(Console(stderr=True), quiet=quiet) as listener:
             state = submission.follow(listener)
