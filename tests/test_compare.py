@@ -19,6 +19,7 @@ from ppdf_dask.errors import ParameterError, SurveyError
 from ppdf_dask.experiments import compare as study
 from ppdf_dask.experiments import figures, tuning, workers
 from ppdf_dask.experiments.compare import Comparison, cases, configured, site_files
+from ppdf_dask.experiments.labelled import read
 from ppdf_dask.experiments.rasters import read_raster
 from ppdf_dask.experiments.reports import SIX, Report, csv_text
 from ppdf_dask.experiments.tuning import GRIDS, Grid, grids, leave_one_out
@@ -65,7 +66,11 @@ def by_hand(path, params):
 def test_rows_are_what_one_gets_by_hand(folder, found):
     _, result = found
     assert result.failures == ()
-    assert result.cases == ("smrf default", "ppdf robust", "ppdf paper", "msf default", "msf paper", "smrf tuned")
+    assert result.cases == (
+        *("smrf default", "ppdf robust", "ppdf paper"),
+        *("msf default", "msf paper", "msf paper-seeded"),
+        "smrf tuned",
+    )
     assert [s["site"] for s in result.sites] == ["=b", "a", "c|d"]
     for row in result.rows:
         assert row.scores == by_hand(folder / f"{row.site}.laz", row.case.params), row.case.name
@@ -129,7 +134,7 @@ def test_terrain_models_and_their_errors(found):
 
 
 def test_cases_follow_the_profiles():
-    assert [c.name for c in cases(["smrf", "csf"], ["paper"])] == ["csf paper"]
+    assert [c.name for c in cases(["smrf", "csf"], ["paper"])] == ["csf paper", "csf paper-smooth"]
     assert [c.name for c in cases(["pmf"], ["all"])] == ["pmf default", "pmf paper", "pmf pdal"]
     assert {c.filter for c in cases(["all"])} == set(filters.names())
     assert len(cases(["smrf", "all", "smrf"])) == len(cases(["all"]))
@@ -300,28 +305,24 @@ def test_command_writes_everything(folder, client, tmp_path, monkeypatch):
 
 
 def test_sites_command_measures_the_six_sites(client, tmp_path, monkeypatch):
-    import dataclasses
-
     from ppdf_dask import synthetic
 
-    small = [
-        dataclasses.replace(s, extent=(s.extent[0], s.extent[1], s.extent[0] + 30, s.extent[1] + 30))
-        for s in synthetic.six_sites()[1:3]
-    ]
-    monkeypatch.setattr(synthetic, "six_sites", lambda: small)
+    two = synthetic.six_sites()[1:3]
+    monkeypatch.setattr(synthetic, "six_sites", lambda: two)
     words = ["sites", "six-sites", "--quiet", "--scheduler", client.scheduler.address, "--out", str(tmp_path)]
+    words += ["--site-size", "30"]
     shown = CliRunner().invoke(group, words)
     assert shown.exit_code == 0, shown.output
     assert shown.stdout.splitlines()[2].startswith("| 2-valleys |")
     assert SIX in (tmp_path / "sites.md").read_text()
     assert "not public" in SIX
-    first = (tmp_path / "six-sites" / "2-valleys.laz").stat().st_mtime_ns
+    first = (tmp_path / "six-sites-30m" / "2-valleys.laz").stat().st_mtime_ns
     table = json.loads((tmp_path / "sites.json").read_text())["sites"]
     assert [s["site"] for s in table] == ["2-valleys", "3-ridges"]
-    assert table[0]["points"] == study.site_files(tmp_path / "six-sites")[0].points
+    assert table[0]["points"] == read(tmp_path / "six-sites-30m" / "2-valleys.laz").usable.sum()
     assert (tmp_path / "rasters" / "2-valleys" / "chm.tif").is_file()
     assert CliRunner().invoke(group, [*words, "--json"]).exit_code == 0
-    assert (tmp_path / "six-sites" / "2-valleys.laz").stat().st_mtime_ns == first
+    assert (tmp_path / "six-sites-30m" / "2-valleys.laz").stat().st_mtime_ns == first
 
 
 def test_terrestrial_is_passed_on(tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ppdf_dask.cli.options import stack
-from ppdf_dask.cli.show import json_option, save, score_option, show
+from ppdf_dask.cli.show import json_option, save, score_option, show, site_size_option
 from ppdf_dask.errors import ParameterError, PartialRunError, SurveyError
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ study_options = stack(
         "--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for tables, figures, rasters."
     ),
     score_option,
+    site_size_option,
     click.option("--workers", type=click.IntRange(1), metavar="N", help="Local worker processes [default: all CPUs]."),
     click.option("--scheduler", metavar="ADDRESS", help="Use this Dask scheduler instead of a local cluster."),
     click.option("--insecure", is_flag=True, help="Allow an unencrypted scheduler on another machine."),
@@ -45,7 +46,8 @@ study_options = stack(
     default="default,paper",
     show_default=True,
     metavar="LIST",
-    help="Parameter sets; default is each filter's first, all are all; a filter without one is left out there.",
+    help="Parameter sets; default is each filter's first, paper every reading of the paper's Table 2, all are all; a "
+    "filter without one is left out there.",
 )
 @click.option(
     "--config",
@@ -62,7 +64,7 @@ def compare(data: str, as_json: bool, seeds: str, tuning_seed: int, **options: A
     six-sites for the six synthetic sites, or the word terrestrial for PCOM against the voxel filter on scanned plots.
 
     \b
-    ppdf-dask compare six-sites --filters all --out study/
+    ppdf-dask compare six-sites --filters all --tune --out study/
     ppdf-dask compare tiles/ --filters ppdf,smrf --profiles default --score "user_data==0"
     ppdf-dask compare six-sites --tune --out study/ --scheduler tls://10.0.0.1:8786
     ppdf-dask compare terrestrial --out study/
@@ -134,7 +136,7 @@ def _studied(data: str, options: dict[str, Any]) -> Iterator[tuple[Path, list[Si
         out = options["out"] or Path(temporary)
         if data != SIX_SITES and not Path(data).is_dir():
             raise SurveyError(f"{data} is no folder; give the folder of the labelled tiles, or the word {SIX_SITES}")
-        folder = write_six_sites(out / SIX_SITES) if data == SIX_SITES else Path(data)
+        folder = write_six_sites(out, options["site_size"]) if data == SIX_SITES else Path(data)
         files = site_files(folder, options["score"])
         with _connect(options) as client, listen(console, quiet=options["quiet"]) as listener:
             yield out, files, client, listener

@@ -6,7 +6,6 @@ import json
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -55,17 +54,19 @@ chosen_filter = stack(
 )
 
 
+site_size_option = click.option(
+    "--site-size",
+    type=click.FloatRange(20, 300),
+    default=300.0,
+    show_default=True,
+    metavar="M",
+    help="This much of the edge of each synthetic site, around its middle.",
+)
+
 clouds_argument = stack(
     click.argument("clouds", nargs=-1, type=click.Path(exists=True, path_type=Path), metavar="[CLOUDS]..."),
     score_option,
-    click.option(
-        "--site-size",
-        type=click.FloatRange(20, 300),
-        default=300.0,
-        show_default=True,
-        metavar="M",
-        help="Without CLOUDS: this much of the edge of each synthetic site.",
-    ),
+    site_size_option,
 )
 """Labelled files or folders; without any, the six synthetic sites."""
 
@@ -76,15 +77,9 @@ def sources(clouds: Sequence[Path], score: str | None, site_size: float) -> list
     from ppdf_dask.synthetic import six_sites
 
     if not clouds:
-        return [partial(site, replace(s, extent=_part(s.extent, site_size))) for s in six_sites()]
+        return [partial(site, s.middle(site_size)) for s in six_sites()]
     files = [path for given in clouds for path in (files_in(given) if given.is_dir() else [given])]
     return [partial(read, path, score) for path in files]
-
-
-def _part(extent: tuple[float, float, float, float], size: float) -> tuple[float, float, float, float]:
-    """Return the middle of a site."""
-    x, y = (extent[0] + extent[2]) / 2, (extent[1] + extent[3]) / 2
-    return x - size / 2, y - size / 2, x + size / 2, y + size / 2
 
 
 def chosen(filter_name: str, profile: str | None, changes: Sequence[str] = ()) -> Parameters:

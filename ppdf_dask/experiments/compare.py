@@ -22,6 +22,7 @@ from ppdf_dask.experiments.tuning import Grid, leave_one_out
 from ppdf_dask.experiments.workers import Case, Row, SiteFile, measure, measure_site, search
 from ppdf_dask.metrics import Scores
 from ppdf_dask.quarantine import Failure
+from ppdf_dask.synthetic.sites import SITE_SIZE
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -82,23 +83,31 @@ def site_files(folder: str | Path, score: str | None = None) -> list[SiteFile]:
     return found
 
 
-def write_six_sites(folder: str | Path) -> Path:
+def write_six_sites(folder: str | Path, size: float = SITE_SIZE) -> Path:
     """Write the six synthetic sites, with their true classes, as LAZ tiles; those that are there already stay.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Where to put the folder of the tiles, which is named after their size.
+    size : float
+        Edge of each site, m, around its middle; default 300, as in the paper.
 
     Returns
     -------
     Path
-        The folder of the tiles.
+        The folder of the tiles: ``six-sites-300m``.
     """
     from ppdf_dask.synthetic import six_sites
     from ppdf_dask.synthetic.scanner import rect_of
     from ppdf_dask.synthetic.tiles import write_tile
 
-    for made in six_sites():
-        path = Path(folder) / f"{made.name}.laz"
+    tiles = Path(folder) / f"six-sites-{size:g}m"
+    for made in (site.middle(size) for site in six_sites()):
+        path = tiles / f"{made.name}.laz"
         if not path.is_file():
             write_tile(rect_of(made.extent), made.params, [(path, True)], "EPSG:32610")
-    return Path(folder)
+    return tiles
 
 
 def cases(names: Sequence[str], profiles: Sequence[str] = ("default", "paper")) -> list[Case]:
@@ -109,8 +118,8 @@ def cases(names: Sequence[str], profiles: Sequence[str] = ("default", "paper")) 
     names : sequence of str
         Filters; ``all`` stands for all that are installed.
     profiles : sequence of str
-        Profiles; ``default`` stands for each filter's first one, ``all`` for all. A filter without one of the others is
-        left out there.
+        Profiles; ``default`` stands for each filter's first one, ``paper`` for every reading of the paper's Table 2
+        (``paper-seeded``, ``paper-smooth``), ``all`` for all. A filter without one of the others is left out there.
 
     Raises
     ------
@@ -119,8 +128,8 @@ def cases(names: Sequence[str], profiles: Sequence[str] = ("default", "paper")) 
 
     Examples
     --------
-    >>> [case.name for case in cases(["ppdf", "smrf"])]
-    ['ppdf robust', 'ppdf paper', 'smrf default']
+    >>> [case.name for case in cases(["ppdf", "smrf", "msf"])]
+    ['ppdf robust', 'ppdf paper', 'smrf default', 'msf default', 'msf paper', 'msf paper-seeded']
     """
     everywhere = {p for name in filters.names() for p in filters.get(name).profiles} | {"default", "all"}
     unknown = sorted(set(profiles) - everywhere)
@@ -129,11 +138,18 @@ def cases(names: Sequence[str], profiles: Sequence[str] = ("default", "paper")) 
     found: dict[str, Case] = {}
     for name in dict.fromkeys(n for asked in names for n in (filters.names() if asked == "all" else [asked])):
         known = filters.get(name).profiles
-        wanted = [next(iter(known)) if p == "default" else p for p in profiles]
-        for profile in known if "all" in profiles else wanted:
-            if profile in known:
-                found.setdefault(f"{name} {profile}", Case(name, profile, known[profile]))
+        for profile in (each for asked in profiles for each in _meant(asked, list(known))):
+            found.setdefault(f"{name} {profile}", Case(name, profile, known[profile]))
     return list(found.values())
+
+
+def _meant(asked: str, known: Sequence[str]) -> list[str]:
+    """Return the profiles of one filter that a word asks for."""
+    if asked == "all":
+        return list(known)
+    if asked == "default":
+        return [known[0]]
+    return [p for p in known if p == asked or (asked == "paper" and p.startswith("paper-"))]
 
 
 def configured(path: str | Path) -> list[Case]:

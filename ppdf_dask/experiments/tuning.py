@@ -53,7 +53,7 @@ class Grid:
 GRIDS = (
     Grid("ppdf", "robust", {"tolerance": (0.1, 0.2, 0.4), "division_distance": (0.5, 1.0, 2.0)}),
     Grid("ppdf", "paper", {"classification_distance": (0.5, 1.0, 1.5, 2.0), "division_distance": (0.5, 1.0, 2.0)}),
-    Grid("msf", "default", {"slope": (20.0, 30.0, 40.0), "tolerance": (0.3, 0.6), "max_height": (3.0, 6.0)}),
+    Grid("msf", "default", {"slope": (15.0, 20.0, 30.0, 45.0), "tolerance": (0.3, 0.6), "max_height": (3.0, 6.0)}),
     Grid("pmf", "default", {"slope": (15.0, 30.0, 45.0), "initial_height": (0.3, 0.5, 1.0), "window": (17.0, 33.0)}),
     Grid("csf", "default", {"rigidness": (1, 2, 3), "threshold": (0.3, 0.5, 1.0)}),
     Grid("ptdf", "default", {"iteration_angle": (10.0, 20.0, 30.0), "iteration_distance": (0.75, 1.5, 3.0)}),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ppdf_dask.synthetic.params import SyntheticParams
 
@@ -30,6 +30,17 @@ class Site:
     points_per_m2: float
     extent: tuple[float, float, float, float]
     params: SyntheticParams
+
+    def middle(self, size: float) -> Site:
+        """Return the middle of the site, `size` m wide and high: the same landscape, the same points, fewer of them.
+
+        Examples
+        --------
+        >>> six_sites()[0].middle(100.0).extent
+        (600100.0, 4400100.0, 600200.0, 4400200.0)
+        """
+        x, y = (self.extent[0] + self.extent[2]) / 2, (self.extent[1] + self.extent[3]) / 2
+        return replace(self, extent=(x - size / 2, y - size / 2, x + size / 2, y + size / 2))
 
 
 def six_sites() -> tuple[Site, ...]:
