@@ -1,7 +1,12 @@
 """The filters: points in, mask out. One registry; nothing here knows of Dask, Zarr or LAS.
 
 A filter is a `Filter` record. The built-in ones and those of other packages are found through the entry-point group
-``ppdf_dask.filters``.
+``ppdf_dask.filters``: a package that declares ::
+
+    [project.entry-points."ppdf_dask.filters"]
+    flat = "their_package:FILTER"
+
+has added ``--filter flat`` to every command. The parameter class must be the filter's own: it tells whose it is.
 """
 
 from __future__ import annotations
@@ -69,24 +74,46 @@ def get(name: str) -> Filter:
     Raises
     ------
     ParameterError
-        When no installed package offers it.
+        When no installed package offers it, two do, or what the package offers cannot be imported or is no filter.
     """
-    for entry in _entries():
-        if entry.name == name:
-            found = entry.load()
-            if not isinstance(found, Filter):
-                raise ParameterError(f"the entry point {entry.value!r} of filter {name!r} is not a ppdf_dask Filter")
-            return found
-    raise ParameterError(f"there is no filter {name!r}; installed: {', '.join(names())}")
+    offered = {e.value: e for e in _entries() if e.name == name}
+    if not offered:
+        raise ParameterError(f"there is no filter {name!r}; installed: {', '.join(names())}")
+    if len(offered) > 1:
+        raise ParameterError(
+            f"the filter {name!r} is offered by {' and '.join(sorted(offered))}; uninstall one of them"
+        )
+    ((value, entry),) = offered.items()
+    try:
+        found = entry.load()
+    except (ImportError, AttributeError) as error:
+        raise ParameterError(
+            f"the filter {name!r} cannot be loaded from {value!r} ({error}); repair or uninstall its package"
+        ) from error
+    if not isinstance(found, Filter):
+        raise ParameterError(f"the entry point {value!r} of filter {name!r} is not a ppdf_dask Filter")
+    return found
 
 
 def of(params: Parameters) -> Filter:
-    """Return the filter that a parameter object belongs to."""
+    """Return the filter that a parameter object belongs to.
+
+    Raises
+    ------
+    ParameterError
+        When no installed filter takes such parameters; it names those that could not be loaded. A filter that cannot be
+        loaded is in nobody's way otherwise.
+    """
+    broken = []
     for name in names():
-        candidate = get(name)
+        try:
+            candidate = get(name)
+        except ParameterError as error:
+            broken.append(str(error))
+            continue
         if any(type(p) is type(params) for p in candidate.profiles.values()):
             return candidate
-    raise ParameterError(f"no installed filter takes {type(params).__name__}")
+    raise ParameterError("; ".join([f"no installed filter takes {type(params).__name__}", *broken]))
 
 
 def parameters(name: str, profile: str | None = None) -> Parameters:
