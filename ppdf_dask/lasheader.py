@@ -29,12 +29,17 @@ WKT, GEO_KEYS = 2112, 34735
 
 
 class Reject(Exception):
-    """A file that must not be used; carries a reason code and a sentence that says where and why."""
+    """A file that must not be used; carries a reason code and a sentence that says where and why.
+
+    `box` is where the file says that its points are, lowest and highest x, y, z in its own units; None when its header
+    does not say or cannot mean it.
+    """
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code
         self.message = message
+        self.box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
 @dataclass(frozen=True)
@@ -142,7 +147,12 @@ def read_header(path: str) -> Header:
             raise Reject("not-a-file", "is not a regular file")
         with open(path, "rb", buffering=1 << 14) as file:
             status = os.fstat(file.fileno())
-            return _parse(_Draft(file, status.st_size), status.st_mtime_ns)
+            try:
+                return _parse(_Draft(file, status.st_size), status.st_mtime_ns)
+            except Reject as reject:
+                file.seek(0)
+                reject.box = _claimed_box(file.read(_HEADER_SIZES[0]))
+                raise
     except PermissionError:
         raise Reject("permission", "may not be read (permission denied)") from None
     except FileNotFoundError:
@@ -221,6 +231,18 @@ def _parse(draft: _Draft, mtime_ns: int) -> Header:
         wkt_first=encoding_wkt or point_format >= 6,
         warnings=tuple(draft.warnings),
     )
+
+
+def _claimed_box(head: bytes) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """Return the bounds of a file that is broken behind its header, as far as 32-bit integers can reach them."""
+    if len(head) < _HEADER_SIZES[0] or head[:4] != b"LASF":
+        return None
+    numbers = struct.unpack_from("<12d", head, 131)
+    scales, offsets, high, low = numbers[0:3], numbers[3:6], numbers[6:12:2], numbers[7:12:2]
+    for s, o, a, b in zip(scales, offsets, low, high, strict=True):
+        if not all(map(math.isfinite, (s, o, a, b))) or not o - s * 2.0**31 <= a <= b <= o + s * 2.0**31:
+            return None
+    return low, high
 
 
 def _signature(draft: _Draft) -> bytes:

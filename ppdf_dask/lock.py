@@ -146,7 +146,7 @@ def _is_here(lock: dict[str, Any]) -> bool:
 
 
 def _surely_dead(lock: dict[str, Any]) -> bool:
-    return _is_here(lock) and lock.get("started") != _started(int(lock["pid"]))
+    return _is_here(lock) and lock.get("started") != _started(lock.get("pid"))
 
 
 def _boot() -> str:
@@ -157,7 +157,7 @@ def _boot() -> str:
     return found
 
 
-def _started(pid: int) -> str:
+def _started(pid: object) -> str:
     """Return when a process began, in the kernel's ticks; nothing when it is gone or only waits to be buried."""
     try:
         state, *rest = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()

@@ -7,24 +7,35 @@ gets its own name. Of layered files (formats 6 to 8) one layer is made anew and 
 
 from __future__ import annotations
 
-import io
 import os
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import laspy
+import lazrs
 import numpy as np
 import numpy.typing as npt
-from laspy.errors import LaspyException
 
-from ppdf_dask.classes import new_classes
+from ppdf_dask.classes import LEGACY_FORMATS, Bytes, check_writable, new_classes
 from ppdf_dask.errors import StoreError, TileError
-from ppdf_dask.lasheader import Header
-from ppdf_dask.reader import BATCH, CLASSES, FLAGS, PLACES, Batch, Decoder, header_of, records
+from ppdf_dask.lascopy import Surroundings
+from ppdf_dask.lasheader import RECORD_LENGTHS, Header, Reject, read_header
+from ppdf_dask.reader import (
+    ALL,
+    BATCH,
+    BATCH_BYTES,
+    CLASSES,
+    FLAGS,
+    PLACES,
+    Batch,
+    Decoder,
+    header_of,
+    records,
+    tile_records,
+)
 from ppdf_dask.relabel import can_relabel, differs, relabel
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiler import TileJob, owners
@@ -83,25 +94,23 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
     TileError
         The source is damaged or changed, or the written file does not read back as it was meant.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(job.params.classes, job.tile.point_format, shown(job.tile.path))
     # Short, for the target's own name may be as long as names can be.
     part = target.with_name(f".{zlib.crc32(target.name.encode()):08x}.{os.getpid()}.part")
     header, compress = header_of(job.tile), target.suffix != ".las"
-    job.tile.check_unchanged()
     try:
-        if compress and can_relabel(header, BATCH):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if compress and can_relabel(header, _at_once(header)):
             meant = _relabel(job, header, part, ground_of)
         else:
             meant = _copy(job, header, part, ground_of, compress=compress)
         job.tile.check_unchanged()
-        if job.tile.version == "1.0":
-            _set_minor_version(part, 0)
         crc = crc32_of(part)
         os.replace(part, target)
-    except (LaspyException, OSError) as error:
+    except OSError as error:
         raise TileError(f"{shown(job.tile.path)} could not be written to {target}: {error}") from error
     finally:
-        with suppress(FileNotFoundError):
+        with suppress(FileNotFoundError, NotADirectoryError):
             part.unlink()
     return {**meant.record(), "bytes": target.stat().st_size, "crc32": crc}
 
@@ -119,7 +128,7 @@ class _Histogram:
     """Counts and running checksums of classes and whole records: what was meant against what was written."""
 
     def __init__(self) -> None:
-        self.points, self.changed, self.crc, self.records = 0, 0, 0, 0
+        self.points, self.changed, self.crc, self.records, self.around = 0, 0, 0, 0, 0
         self.classes = np.zeros(256, np.int64)
 
     def add(self, classes: npt.NDArray[np.uint8], records: npt.NDArray[Any] | None = None) -> None:
@@ -133,14 +142,15 @@ class _Histogram:
         histogram = {str(k): int(self.classes[k]) for k in np.flatnonzero(self.classes)}
         return {"points": self.points, "changed": self.changed, "classes": histogram}
 
-    def check(self, part: Path, *, whole: bool) -> None:
+    def check(self, job: TileJob, part: Path, *, whole: bool) -> None:
         """Decode a file, its classes or all of it, and refuse it when that is not what was meant."""
         try:
             found = _count(part, whole=whole)
         except TileError as error:
-            raise _not_as_written(part, str(error)) from error
-        if (found.points, found.crc, found.records) != (self.points, self.crc, self.records):
-            raise _not_as_written(part, f"{found.points} of {self.points} points")
+            raise _not_as_written(job, part, str(error)) from error
+        sums = (found.points, found.crc, found.records, found.around)
+        if sums != (self.points, self.crc, self.records, self.around):
+            raise _not_as_written(job, part, f"{found.points} of {self.points} points")
 
 
 class _Labels:
@@ -165,73 +175,64 @@ def _relabel(job: TileJob, header: Header, part: Path, ground_of: GroundOf) -> _
     assert header.laszip.chunk_size is not None
     labels = _Labels(job, header, ground_of)
     dtype = np.dtype((np.void, header.record_length))
-    size = BATCH // header.laszip.chunk_size * header.laszip.chunk_size
-    raw = (np.frombuffer(data, dtype) for data in records(job.tile, header, size, PLACES | CLASSES | FLAGS))
+    size = _at_once(header) // header.laszip.chunk_size * header.laszip.chunk_size
+    raw = (np.frombuffer(data, dtype) for data in tile_records(job.tile, header, size, PLACES | CLASSES | FLAGS))
     relabel(job.tile.path, header, part, ((some, labels.of(some)) for some in raw))
-    job.tile.check_unchanged()
     trouble = differs(job.tile.path, header, part)
     if trouble:
-        raise _not_as_written(part, trouble)
-    labels.meant.check(part, whole=False)
+        raise _not_as_written(job, part, trouble)
+    labels.meant.check(job, part, whole=False)
     return labels.meant
 
 
+def _at_once(header: Header) -> int:
+    """Return how many points the reader gives at a time at most."""
+    return min(BATCH, BATCH_BYTES // header.record_length)
+
+
 def _copy(job: TileJob, header: Header, part: Path, ground_of: GroundOf, *, compress: bool) -> _Histogram:
-    """Decode and encode everything, decode what was written and compare."""
-    labels, backend = _Labels(job, header, ground_of), laspy.LazBackend.Lazrs
+    """Decode and encode all points, carry over the bytes around them, decode what was written and compare."""
+    labels = _Labels(job, header, ground_of)
     meant = labels.meant
-    with _opened(job.tile.path) as file, laspy.open(file, closefd=False, laz_backend=backend) as source:
-        plain = plain_header(source.header)
-        with laspy.open(part, "w", header=plain, laz_backend=backend, do_compress=compress) as out:
-            for points in source.chunk_iterator(BATCH):
-                points.classification = labels.of(points.array)
-                out.write_points(points)
-                meant.records = zlib.crc32(np.ascontiguousarray(points.array).view(np.uint8).data, meant.records)
-            evlrs = [v for v in source.evlrs or [] if v.user_id != "copc"]
-            if evlrs:
-                out.write_evlrs(laspy.vlrs.vlrlist.VLRList(evlrs))
-    if meant.points != job.tile.point_count:
-        raise TileError(f"{shown(job.tile.path)} holds {meant.points} points, its header says {job.tile.point_count}")
-    meant.check(part, whole=True)
+    with open(job.tile.path, "rb") as source, part.open("w+b") as out:
+        around = Surroundings.of(source, header)
+        meant.around = around.checksum(source)
+        vlr = _laszip(header) if compress else None
+        around.begin(out, header, None if vlr is None else bytes(vlr.record_data()))
+        writer = None if vlr is None else lazrs.LasZipCompressor(out, vlr)
+        for raw in tile_records(job.tile, header, BATCH, ALL):
+            packed = np.frombuffer(raw, np.uint8)
+            _set_classes(packed, labels.of(packed.view((np.void, header.record_length))), header)
+            _ = out.write(packed.data) if writer is None else writer.compress_many(packed)
+            meant.records = zlib.crc32(packed.data, meant.records)
+        if writer is not None:
+            writer.done()
+        out.seek(0, os.SEEK_END)
+        around.end(out, source)
+    meant.check(job, part, whole=True)
     return meant
 
 
-def _not_as_written(part: Path, why: str) -> TileError:
-    return TileError(f"{part} does not read back as written ({why}); check the disk and run again")
+def _laszip(header: Header) -> Any:
+    extra = header.record_length - RECORD_LENGTHS[header.point_format]
+    return lazrs.LazVlr.new_for_compression(header.point_format, extra)
 
 
-class _AsVersion11(io.FileIO):
-    """A LAS 1.0 file that calls itself 1.1, for laspy does not know 1.0; the two differ in reserved fields only."""
-
-    def readinto(self, buffer: Any, /) -> int:
-        start = self.tell()
-        got = super().readinto(buffer)
-        if start <= _MINOR_VERSION < start + got:
-            buffer[_MINOR_VERSION - start] = 1
-        return got
+def _class_bytes(packed: Bytes, header: Header) -> tuple[Bytes, int]:
+    """Return the bytes of packed records that hold the class, and which bits of them (LAS 1.4 R15, tables 7, 15)."""
+    legacy = header.point_format in LEGACY_FORMATS
+    return packed.reshape(-1, header.record_length)[:, 15 if legacy else 16], 0b1_1111 if legacy else 0xFF
 
 
-_MINOR_VERSION = 25
-"""Byte of the header that tells LAS 1.0 from 1.4."""
+def _set_classes(packed: Bytes, classes: Bytes, header: Header) -> None:
+    column, bits = _class_bytes(packed, header)
+    column[...] = column & (bits ^ 0xFF) | classes
 
 
-def _opened(path: str | Path) -> BinaryIO:
-    with open(path, "rb") as file:
-        old = file.read(_MINOR_VERSION + 1)[_MINOR_VERSION:] == b"\0"
-    return io.BufferedReader(_AsVersion11(path)) if old else open(path, "rb")
-
-
-def _set_minor_version(path: Path, minor: int) -> None:
-    with path.open("r+b") as file:
-        file.seek(_MINOR_VERSION)
-        file.write(bytes([minor]))
-
-
-def plain_header(header: laspy.LasHeader) -> laspy.LasHeader:
-    """Return the header for the result: the same but for the COPC index, which describes the old order of bytes."""
-    kept = [v for v in header.vlrs if v.user_id != "copc"]
-    header.vlrs = laspy.vlrs.vlrlist.VLRList(kept)
-    return header
+def _not_as_written(job: TileJob, part: Path, why: str) -> TileError:
+    return TileError(
+        f"{shown(job.tile.path)}: {part} does not read back as written ({why}); check the disk and run again"
+    )
 
 
 def class_counts(path: Path) -> dict[str, Any]:
@@ -246,23 +247,19 @@ def class_counts(path: Path) -> dict[str, Any]:
 
 
 def _count(path: Path, *, whole: bool) -> _Histogram:
-    """Decode a written file: its classes, or all of its records."""
-    found, chosen = _Histogram(), laspy.DecompressionSelection.all()
-    if not whole:
-        chosen = laspy.DecompressionSelection.base() | laspy.DecompressionSelection.CLASSIFICATION
-    backend = laspy.LazBackend.Lazrs
+    """Decode a written file: its classes, or all of its records and what surrounds them."""
+    found = _Histogram()
     try:
-        with (
-            _opened(path) as file,
-            laspy.open(file, closefd=False, laz_backend=backend, decompression_selection=chosen) as reader,
-        ):
-            for points in reader.chunk_iterator(BATCH):
-                found.add(np.asarray(points.classification, np.uint8), points.array if whole else None)
-    except (KeyboardInterrupt, SystemExit):
-        raise
-    # The decompressor may panic on a broken stream, which is not an Exception.
-    except BaseException as error:
-        raise TileError(f"{shown(str(path))} cannot be decoded: {error}") from None
+        header = read_header(str(path))
+    except Reject as reject:
+        raise TileError(f"{shown(str(path))} {reject.message}") from None
+    if whole:
+        with path.open("rb") as file:
+            found.around = Surroundings.of(file, header).checksum(file)
+    for raw in records(str(path), header, BATCH, ALL if whole else CLASSES):
+        packed = np.frombuffer(raw, np.uint8)
+        column, bits = _class_bytes(packed, header)
+        found.add(np.bitwise_and(column, np.uint8(bits)), packed if whole else None)
     return found
 
 

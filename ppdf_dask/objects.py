@@ -93,7 +93,7 @@ class ObjectStore:
             return None
         try:
             return dict(json.loads(raw)["attributes"])
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             raise self.damage(path, "has torn metadata") from None
 
     def damage(self, path: str, what: str, kind: str = "torn") -> DamagedError:

@@ -69,9 +69,13 @@ class Parameters:
             value = getattr(self, f.name)
             if f.metadata.get("unit") is not None:
                 _check_quantity(f, value)
+                if int in (hints[f.name], *typing.get_args(hints[f.name])) and not isinstance(value, int | None):
+                    raise ParameterError(f"{f.name} = {value!r} {f.metadata['unit']} is not a whole number")
+            elif hints[f.name] is bool and not isinstance(value, bool):
+                raise ParameterError(f"{f.name} = {value!r} is neither true nor false")
             elif typing.get_origin(hints[f.name]) is Literal:
                 choices = typing.get_args(hints[f.name])
-                if value not in choices:
+                if not isinstance(value, str) or value not in choices:
                     raise ParameterError(
                         f"{f.name} = {value!r} is unknown; choose one of {', '.join(map(repr, choices))}"
                     )
@@ -164,10 +168,12 @@ class ClassRules(Parameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.returns not in (None, "last", "all"):
+        if self.returns is not None and self.returns not in typing.get_args(Returns):
             raise ParameterError(f"returns = {self.returns!r} is unknown; choose 'last' or 'all'")
-        if self.from_classes is not None and any(c < 0 or c > 255 for c in self.from_classes):
-            raise ParameterError(f"from_classes = {self.from_classes!r} must be ASPRS classes between 0 and 255")
+        # A configuration file may hold anything here.
+        classes: Any = () if self.from_classes is None else self.from_classes
+        if not isinstance(classes, tuple) or not all(type(c) is int and 0 <= c <= 255 for c in classes):
+            raise ParameterError(f"from_classes = {classes!r} must be a list of ASPRS classes between 0 and 255")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ppdf_dask.errors import StoreError
+
 FILE = "failures.json"
 
 
@@ -51,9 +53,18 @@ def write_failures(out: Path, failures: list[dict[str, Any]], waiting: list[Any]
 
 
 def read_failures(out: Path) -> dict[str, Any]:
-    """Return what ``failures.json`` holds; empty lists when there is none."""
+    """Return what ``failures.json`` holds; empty lists when there is none.
+
+    Raises
+    ------
+    StoreError
+        When it is damaged: it may be removed, the next run writes it again.
+    """
     path = out / FILE
     if not path.is_file():
         return {"failures": [], "waiting": []}
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return found
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return {name: [dict(entry) for entry in found[name]] for name in ("failures", "waiting")}
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise StoreError(f"{path} is damaged; remove it: the next `ppdf-dask retry {out}` writes it again") from None

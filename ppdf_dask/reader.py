@@ -29,7 +29,10 @@ Ints = npt.NDArray[np.int64]
 BATCH = 1_000_000
 """Points decoded at once by default: about 100 MB at the peak."""
 
-PLACES, HEIGHTS, CLASSES, FLAGS = 0, 1, 2, 4
+BATCH_BYTES = 100_000_000
+"""Bytes of records decoded at once at most: records may be 64 kB long."""
+
+PLACES, HEIGHTS, CLASSES, FLAGS, ALL = 0, 1, 2, 4, 2**32 - 1
 """Layers of formats 6 to 10 to decode, by the bits of LASzip's selective decompression; x, y and returns always are."""
 
 _INT64 = 2**62
@@ -104,15 +107,13 @@ def batches(
         When the file changed since the scan, is cut off, corrupt or holds another number of points than its header
         says; the message names the file and the point.
     """
-    tile.check_unchanged()
     header = header_of(tile)
     decoder = Decoder.make(header, (unit_xy, unit_z), rules, returns)
     start = 0
-    for raw in records(tile, header, size, PLACES | HEIGHTS | CLASSES | FLAGS):
+    for raw in tile_records(tile, header, size, PLACES | HEIGHTS | CLASSES | FLAGS):
         batch = decoder.measure(np.frombuffer(raw, decoder.dtype), start)
         yield batch
         start += batch.n
-    tile.check_unchanged()
 
 
 @dataclass(frozen=True)
@@ -242,11 +243,15 @@ class GridAxis:
 
 
 def header_of(tile: Tile) -> Header:
-    """Read a tile's header again; raises TileError when it is no longer readable."""
+    """Read a tile's header again; raises TileError when it is no longer readable, or another one than at the scan."""
+    tile.check_unchanged()
     try:
-        return read_header(tile.path)
+        header = read_header(tile.path)
     except Reject as reject:
         raise TileError(f"{shown(tile.path)}: {reject.message}") from None
+    if header.point_count != tile.point_count or header.size != tile.size:
+        raise TileError(f"{shown(tile.path)} changed since the scan; scan again and start a new run")
+    return header
 
 
 def _record_dtype(header: Header) -> np.dtype[Any]:
@@ -259,65 +264,74 @@ def _record_dtype(header: Header) -> np.dtype[Any]:
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": header.record_length})
 
 
-def records(tile: Tile, header: Header, size: int, wanted: int) -> Iterator[bytearray]:
-    """Yield the packed records of up to `size` points at a time.
+def tile_records(tile: Tile, header: Header, size: int, wanted: int) -> Iterator[bytearray]:
+    """Decode the packed records of a tile, see `records`; a tile that changes meanwhile is refused."""
+    try:
+        yield from records(tile.path, header, size, wanted)
+    finally:
+        tile.check_unchanged()
+
+
+def records(path: str, header: Header, size: int, wanted: int) -> Iterator[bytearray]:
+    """Decode the packed records of a file.
 
     Parameters
     ----------
-    tile : Tile
-        As scanned.
-    header : Header
-        Of the same file, just read.
+    path, header : str, Header
+        The file and its header, just read.
     size : int
-        Points at a time.
+        Points at a time at most; fewer when the records are so long that they would fill the memory.
     wanted : int
-        The sum of `PLACES`, `HEIGHTS`, `CLASSES` and `FLAGS` as needed: which layers of formats 6 to 10 are decoded;
-        what is not may hold anything.
+        The sum of `PLACES`, `HEIGHTS`, `CLASSES` and `FLAGS` as needed, or `ALL`: which layers of formats 6 to 10 are
+        decoded; what is not may hold anything.
+
+    Yields
+    ------
+    bytearray
+        In file order; together all points the header promises.
 
     Raises
     ------
     TileError
-        As `batches`.
+        When the file is cut off, corrupt, or holds another number of points.
     """
-    if header.point_count != tile.point_count or header.size != tile.size:
-        raise TileError(f"{shown(tile.path)} changed since the scan; scan again and start a new run")
     if header.point_count == 0:
         return
-    with open(tile.path, "rb") as file:
+    size = max(1, min(size, BATCH_BYTES // header.record_length))
+    with open(path, "rb") as file:
         if header.laszip is not None:
-            _check_chunks(tile, file, header, header.laszip)
-            read = _decompressor(tile, file, header, header.laszip, wanted)
+            _check_chunks(path, file, header, header.laszip)
+            read = _decompressor(path, file, header, header.laszip, wanted)
         else:
             file.seek(header.offset_to_points)
             read = file.readinto
         for start in range(0, header.point_count, size):
             n = min(size, header.point_count - start)
             buffer = bytearray(n * header.record_length)
-            got = _decode(tile, read, buffer, start, n)
+            got = _decode(path, read, buffer, start, n)
             if got is not None and got < len(buffer):
                 raise TileError(
-                    f"{shown(tile.path)} ends at point {start + got // header.record_length} of {header.point_count}; "
+                    f"{shown(path)} ends at point {start + got // header.record_length} of {header.point_count}; "
                     "it was cut off: get it anew"
                 )
             yield buffer
 
 
-def _decode(tile: Tile, read: Any, buffer: bytearray, start: int, n: int) -> int | None:
+def _decode(path: str, read: Any, buffer: bytearray, start: int, n: int) -> int | None:
     try:
         got = read(buffer)
     except (KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     # The decompressor reports a broken stream as its own error, or panics, which is not an Exception.
     except BaseException as error:
-        tile.check_unchanged()
         raise TileError(
-            f"{shown(tile.path)} cannot be decoded between points {start} and {start + n}: {error}; it is corrupt or "
+            f"{shown(path)} cannot be decoded between points {start} and {start + n}: {error}; it is corrupt or "
             "cut off: get it anew"
         ) from None
     return None if got is None else int(got)
 
 
-def _decompressor(tile: Tile, file: BinaryIO, header: Header, laszip: Laszip, wanted: int) -> Any:
+def _decompressor(path: str, file: BinaryIO, header: Header, laszip: Laszip, wanted: int) -> Any:
     import lazrs
 
     file.seek(header.offset_to_points)
@@ -327,20 +341,18 @@ def _decompressor(tile: Tile, file: BinaryIO, header: Header, laszip: Laszip, wa
     def make(_: bytearray) -> None:
         made.append(lazrs.LasZipDecompressor(file, laszip.record, lazrs.DecompressionSelection(wanted)))
 
-    _decode(tile, make, bytearray(), 0, header.point_count)
+    _decode(path, make, bytearray(), 0, header.point_count)
     return made[0].decompress_many
 
 
-def _check_chunks(tile: Tile, file: BinaryIO, header: Header, laszip: Laszip) -> None:
+def _check_chunks(path: str, file: BinaryIO, header: Header, laszip: Laszip) -> None:
     """Walk the heads of layered chunks: layer sizes must fill the file's points exactly, counts add up.
 
     So a lying size never reaches the decompressor, which would allocate it. Chunks of formats 0 to 5 have no head.
     """
     if not laszip.layered:
         return
-    walk = chunks(file, laszip, header.record_length, header.offset_to_points + 8, shown(tile.path))
+    walk = chunks(file, laszip, header.record_length, header.offset_to_points + 8, shown(path))
     points = sum(chunk.points for chunk in walk)
     if points != header.point_count:
-        raise TileError(
-            f"{shown(tile.path)} holds {points} points but its header says {header.point_count}; get it anew"
-        )
+        raise TileError(f"{shown(path)} holds {points} points but its header says {header.point_count}; get it anew")

@@ -36,7 +36,7 @@ _POINT14, _LAYERS = 30, 9
 _EVLR_START = 235
 """Byte of the header that says where the EVLRs begin (LAS 1.4 R15, table 3)."""
 
-_UNTIDY = {"legacy-count", "chunk-table", "format-version", "trailing"}
+_UNTIDY = {"chunk-table", "trailing"}
 """What a header is warned of that a copy by bytes would hand on."""
 
 

@@ -80,7 +80,7 @@ def take_notes(out: Path, store: RunStore) -> None:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         redo, remove = [str(p) for p in found["redo"]], [str(p) for p in found["remove"]]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         redo, remove = [], []
     for damaged in redo:
         heal(store, damaged)

@@ -33,7 +33,7 @@ from ppdf_dask.repair import heal, sweep, take_notes
 from ppdf_dask.saved import save_plan
 from ppdf_dask.stages import Cutting, Inputs, Records, Waiting
 from ppdf_dask.store import RunStore
-from ppdf_dask.tiles import shown
+from ppdf_dask.tiles import problem_dict, shown
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -246,6 +246,8 @@ class _Run:
             raise PlanError(f"{points_in} points came in but {points_out} went out; report this with run.json")
         report = self._report()
         write_json(self.plan.out / "run.json", report)
+        if self._left_out():
+            self._partial()
         (self.plan.out / "failures.json").unlink(missing_ok=True)
         self.on_event(Event("run", "finished", record=report["counts"]))
         unproven = report["counts"]["unproven"]
@@ -264,6 +266,7 @@ class _Run:
             "platform": platform.platform(),
             "packages": {name: version(name) for name in PACKAGES},
             "inputs": [t.as_dict() for t in self.inputs.sources.values()],
+            "left_out": [problem_dict(p) for p in self.plan.survey.problems if p.fatal],
             "crs": self.plan.survey.crs,
             "plan": self.plan.facts(),
             "filter": self.cutting.filter.as_dict(),
@@ -285,7 +288,7 @@ class _Run:
         }
 
     def _partial(self) -> None:
-        described = [self._describe(f) for f in self.failures.values()]
+        described = self._left_out() + [self._describe(f) for f in self.failures.values()]
         path = write_failures(self.plan.out, described, self.waiting)
         lines = [f"  {d['stage']} {d['id']} ({d['what']}): {d['error']}" for d in described]
         lines += [f"  {path}: damaged again each time it was made" for path in self.damaged]
@@ -298,7 +301,29 @@ class _Run:
             + (f"\n{unproven} points near what failed are classified but not proven" if unproven else "")
             + f"\nDetails are in {path}. Mend the cause, then `ppdf-dask retry {self.plan.out}` does only what is "
             "missing; `ppdf-dask debug` replays one chunk alone."
+            + (
+                " Files that were left out come in by `ppdf-dask run` with --accept-changes."
+                if self._left_out()
+                else ""
+            )
         )
+
+    def _left_out(self) -> list[dict[str, Any]]:
+        """Return the files that the scan found unusable and was told to leave out, as failures."""
+        return [
+            {
+                "stage": "scan",
+                "id": p.code,
+                "what": shown(p.path),
+                "bounds_m": None if p.place is None else [v / MM for v in p.place],
+                "files": [p.path],
+                "error": p.message,
+                "traceback": "",
+                "need_mb": None,
+            }
+            for p in self.plan.survey.problems
+            if p.fatal
+        ]
 
     def _describe(self, failure: Failure) -> dict[str, Any]:
         """Return all that helps to find the cause of a failure."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ppdf_dask import filters
-from ppdf_dask.errors import StoreError
+from ppdf_dask.errors import PpdfError, StoreError
 from ppdf_dask.grid import ChunkGrid
 from ppdf_dask.params import ChunkParams, ClassRules, DtmParams, RunParams
 from ppdf_dask.plan import Plan
@@ -30,11 +30,15 @@ def load_plan(out: str | Path) -> Plan:
     store = RunStore(str(Path(out) / "run.zarr"))
     store.attributes()
     values = store.get_record("plan", "plan")
-    if values is None:
-        raise StoreError(
-            f"the plan of {out} is missing; give the `ppdf-dask run TILES --out {out}` command again, which restores it"
-        )
-    return plan_from_dict(values, Path(out))
+    try:
+        if values is not None:
+            return plan_from_dict(values, Path(out))
+    except (LookupError, TypeError, ValueError, AttributeError, StopIteration, PpdfError):
+        pass  # It was written by nobody that we know.
+    raise StoreError(
+        f"the plan of {out} is missing or damaged; give the `ppdf-dask run TILES --out {out}` command again, which "
+        "restores it"
+    )
 
 
 def plan_as_dict(plan: Plan) -> dict[str, Any]:

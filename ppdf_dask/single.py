@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ppdf_dask import filters
-from ppdf_dask.errors import SurveyError
+from ppdf_dask.errors import ParameterError, SurveyError, TileError
 from ppdf_dask.filters.cloud import cloud_from_grid, density
 from ppdf_dask.grid import ChunkGrid
 from ppdf_dask.merge import rewrite
@@ -16,6 +16,7 @@ from ppdf_dask.params import RunParams
 from ppdf_dask.reader import Batch
 from ppdf_dask.survey import Survey
 from ppdf_dask.tiler import TileJob
+from ppdf_dask.tiles import shown
 
 
 def classify_tile(survey: Survey, target: str | Path, params: RunParams | None = None) -> dict[str, Any]:
@@ -61,7 +62,10 @@ def _ground(job: TileJob) -> np.ndarray[Any, np.dtype[np.bool_]]:
     ]
     points = np.concatenate(parts, axis=1) if parts else np.empty((4, 0), np.int64)
     fixed = points[3].astype(np.bool_) if job.params.classes.mode == "refine" else None
-    cloud = cloud_from_grid(points[0], points[1], points[2], fixed)
+    try:
+        cloud = cloud_from_grid(points[0], points[1], points[2], fixed)
+    except ParameterError as error:
+        raise TileError(f"{shown(job.tile.path)}: {error}") from error
     chosen = filters.of(job.params.filter)
     found = chosen.classify(cloud, chosen.resolve(job.params.filter, density(cloud))).ground
     return found if cloud.fixed is None else found | cloud.fixed

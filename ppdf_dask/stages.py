@@ -123,9 +123,9 @@ class Cutting:
 
     @cached_property
     def unknown(self) -> tuple[Rect, ...]:
-        """Places of the tiles that could not be cut, as their headers give them."""
+        """Places of the tiles that were left out or could not be cut, as their headers give them."""
         lost = (t for s, t in self.inputs.sources.items() if s not in self.tiles and t.point_count)
-        return tuple(sorted(t.bounds for t in lost))
+        return tuple(sorted([*(t.bounds for t in lost), *self.inputs.plan.survey.lost]))
 
     @cached_property
     def extent(self) -> Rect:

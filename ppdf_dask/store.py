@@ -316,7 +316,7 @@ class RunStore(ObjectStore):
             return zarr.open_array(self._store, path=path, mode="r", zarr_format=3)
         except FileNotFoundError:
             raise self.damage(path, "is missing", "missing") from None
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise self.damage(path, f"has torn metadata ({error})") from error
 
     def _read(self, path: str, made_by: str | None = None) -> Any:

@@ -30,6 +30,11 @@ WAVEFORM_FORMATS = (4, 5, 9, 10)
 
 _WAVEFORM = "has waveform packets; its result is written uncompressed (.las), for LAZ writers do not agree on them"
 
+_NEAR = 10_000_000
+"""How far from the tiles the place of a file that is left out still matters, mm: more than any chunk or triangle looks.
+
+A broken header may name any place; the raster must not grow towards it."""
+
 _DEGREE_SCALE = 1e-5
 _DEGREES = "has no CRS and looks like degrees; reproject it, or say the unit with --assume-units"
 
@@ -75,6 +80,20 @@ class Survey:
         )
 
     @cached_property
+    def lost(self) -> tuple[Rect, ...]:
+        """Places near the tiles where a file that is left out has its points, mm, as far as they are known."""
+        if self.bounds is None:
+            return ()
+        near = self.bounds.grow(_NEAR)
+        places = (Rect(*p.place) for p in self.problems if p.fatal and p.place)
+        found = (
+            Rect(max(r.x0, near.x0), max(r.y0, near.y0), min(r.x1, near.x1), min(r.y1, near.y1))
+            for r in places
+            if r.intersects(near)
+        )
+        return tuple(sorted(found))
+
+    @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
         """Pairs of tiles whose header bounds overlap by more than 1 mm, by path."""
         return find_overlaps(self.tiles)
@@ -104,7 +123,9 @@ class Survey:
             crs=values["crs"],
             unit_xy=values["unit_xy"],
             unit_z=values["unit_z"],
-            problems=tuple(Problem(**p) for p in values["problems"]),
+            problems=tuple(
+                Problem(**p | {"place": None if p["place"] is None else tuple(p["place"])}) for p in values["problems"]
+            ),
         )
 
     def plot(self, ax: Axes | None = None) -> Axes:
@@ -169,14 +190,17 @@ def scan(
 
     headers: dict[str, Header] = {}
     frames: dict[str, Frame] = {}
+    boxes: dict[str, Any] = {}
     for path in names:
         try:
             header = read_header(path)
         except Reject as reject:
+            boxes[path] = reject.box
             problems.append(Problem(path, reject.code, reject.message, True))
             continue
         problems += [Problem(path, code, message, False) for code, message in header.warnings]
         frames[path] = _frame(header, assumed)
+        boxes[path] = header.mins, header.maxs
         # The records' own bytes would be most of the memory of a large survey.
         headers[path] = replace(header, wkt=None, geo_keys=None)
     for path, frame in frames.items():
@@ -204,6 +228,7 @@ def scan(
         problems += notes
     _refuse(problems, skip_bad)
     bad = {p.path for p in problems if p.fatal}
+    problems = [_placed(p, boxes.get(p.path), reference) for p in problems]
     return Survey(
         tiles=tuple(t for t in tiles if t.path not in bad),
         root=root,
@@ -212,6 +237,16 @@ def scan(
         unit_z=reference.unit_z or reference.unit_xy or 1.0,
         problems=tuple(sorted(problems, key=lambda p: (p.path, not p.fatal, p.code))),
     )
+
+
+def _placed(problem: Problem, box: Any, frame: Frame) -> Problem:
+    """Add to a file that is left out where its points must be."""
+    if not problem.fatal or box is None:
+        return problem
+    unit_xy, unit_z = frame.unit_xy or 1.0, frame.unit_z or frame.unit_xy or 1.0
+    low, high = box
+    found = bounds_in_mm(low, high, unit_xy, unit_z)
+    return problem if found is None else replace(problem, place=(found[0].x0, found[0].y0, found[0].x1, found[0].y1))
 
 
 def _frame(header: Header, assumed: Frame | None) -> Frame:

@@ -33,12 +33,15 @@ class Problem:
         What is wrong and where, for people.
     fatal : bool
         True when the file is not used.
+    place : tuple of int or None
+        Where the points of a file that is not used must be, x0, y0, x1, y1 in mm; None when nothing tells.
     """
 
     path: str
     code: str
     message: str
     fatal: bool
+    place: tuple[int, int, int, int] | None = None
 
     def __str__(self) -> str:
         return f"{shown(self.path)}: {self.message}" if self.path else self.message

@@ -74,14 +74,14 @@ class KilledWorker(Exception):
     """Stands for the scheduler's verdict of this name on a task whose workers died."""
 
 
-def small_plan(tiles: Path, out: Path, **changes: Any) -> Plan:
+def small_plan(tiles: Path, out: Path, *, skip_bad: bool = False, **changes: Any) -> Plan:
     """Return a plan of a few chunks with all that is derived fixed, so that a lost tile changes nothing far away."""
     params = RunParams(
         filter=RobustParams(cell_size=1.5),
         chunks=ChunkParams(chunk_size=25.0, buffer=20.0),
         dtm=DtmParams(resolution=1.0),
     )
-    return plan(scan([tiles]), params.replace(**changes), out=out)
+    return plan(scan([tiles], skip_bad=skip_bad), params.replace(**changes), out=out)
 
 
 def outputs(out: Path) -> dict[str, int]:

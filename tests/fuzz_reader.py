@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of the header and the tile reader.
+"""Coverage-guided fuzzing of the header, the tile reader and the writer of classified tiles.
 
 ::
 
@@ -6,7 +6,8 @@
     python tests/fuzz_reader.py -max_total_time=3600 corpus # by hand; findings become cases of `REGRESSIONS`
 
 Whatever the bytes are: the reader gives exactly as many points as the header says, or refuses the file by name, and
-never holds more memory than a file of this size can need. Needs ``pip install ppdf-dask[fuzz]`` (atheris).
+never holds more memory than a file of this size can need. A file that can be read is written again: it comes out with
+all its points, or is refused by name. Needs ``pip install ppdf-dask[fuzz]`` (atheris).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from lasfiles import OFFSET_TO_POINTS, RECORD_LENGTH, write
+from lasfiles import OFFSET_TO_POINTS, RECORD_LENGTH, write, write_copc
 
 POINTS = 64
 
@@ -34,6 +35,8 @@ def seeds(folder: Path) -> Iterator[bytes]:
                 folder / f"seed{suffix}", mm, point_format=point_format, offset=(0.0, 0.0, 0.0), crs="EPSG:25832"
             )
             yield path.read_bytes()
+    yield write(folder / "seed.las", mm, point_format=4, version="1.3", offset=(0.0, 0.0, 0.0)).read_bytes()
+    yield write_copc(folder / "seed.copc.laz", mm, offset=(0.0, 0.0, 0.0), crs="EPSG:25832").read_bytes()
 
 
 def regressions(folder: Path) -> Iterator[tuple[str, bytes]]:
@@ -63,12 +66,15 @@ def regressions(folder: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def check(data: bytes) -> None:
-    """Read bytes as a file; raise AssertionError when the answer is neither points nor a refusal."""
+    """Read bytes as a file and write it again; raise AssertionError for an answer that is no file and no refusal."""
     # Imported here, for the fuzzer has to watch the import.
     from ppdf_dask.errors import SurveyError
-    from ppdf_dask.params import ClassRules
+    from ppdf_dask.grid import ChunkGrid
+    from ppdf_dask.merge import rewrite
+    from ppdf_dask.params import ClassRules, RunParams
     from ppdf_dask.reader import batches
     from ppdf_dask.survey import scan
+    from ppdf_dask.tiler import TileJob
 
     with tempfile.NamedTemporaryFile(suffix=".laz", dir=_memory()) as file:
         file.write(data)
@@ -81,10 +87,16 @@ def check(data: bytes) -> None:
                 read += batch.n
                 # A compressed point takes more than a ten-thousandth of a byte: the reader's own limit.
                 assert read <= 10_000 * len(data)
+            assert read == tile.point_count
+            target = Path(f"{file.name}.out{Path(tile.name).suffix}")
+            job = TileJob("s_000000", tile, 1.0, 1.0, RunParams(), ChunkGrid.from_metres(100.0), 0)
+            try:
+                assert rewrite(job, target, lambda batch: batch.eligible)["points"] == read
+                assert scan(target, assume_units="m").point_count == read
+            finally:
+                target.unlink(missing_ok=True)
         except SurveyError as error:
             assert file.name in str(error)  # noqa: PT017
-        else:
-            assert read == tile.point_count
 
 
 def _memory() -> str | None:
@@ -98,6 +110,7 @@ def main() -> None:
     except ImportError:
         sys.exit("fuzzing needs atheris: pip install ppdf-dask[fuzz]")
     with atheris.instrument_imports(include=["ppdf_dask"]):
+        import ppdf_dask.merge
         import ppdf_dask.survey  # noqa: F401
     with tempfile.TemporaryDirectory() as folder:
         corpus = Path(folder) / "corpus"

@@ -57,6 +57,50 @@ def write(
     return path
 
 
+def write_copc(path: Path, mm: np.ndarray | None = None, **options: Any) -> Path:
+    """Write a true COPC file: a root node and its eight octants, one chunk each, and the hierarchy that says where."""
+    import io
+
+    import lazrs
+
+    mm = points(4000) if mm is None else mm
+    source = write(path.with_suffix(".las"), mm, **options)
+    head = bytearray(source.read_bytes())
+    source.unlink()
+    start, count = struct.unpack_from("<II", head, OFFSET_TO_POINTS)
+    length = struct.unpack_from("<H", head, RECORD_LENGTH)[0]
+    rows = np.frombuffer(bytes(head[start : start + len(mm) * length]), np.uint8).reshape(-1, length)
+    half = float(np.ptp(mm, axis=0).max()) / 2000 + 0.001
+    centre = (mm.min(axis=0) + mm.max(axis=0)) / 2000
+    octant = (mm / 1000 >= centre).astype(int)
+    octant[::10] = -1  # every tenth point is the root's
+    laszip = lazrs.LazVlr.new_for_compression(struct.unpack_from("<B", head, FORMAT)[0], 0, True)
+    record = bytes(laszip.record_data())
+    records = bytes(head[375:start]) + struct.pack("<H16sHH32s", 0, b"laszip encoded", 22204, len(record), b"") + record
+    first = 375 + 54 + 160 + len(records)
+    out = io.BytesIO(bytes(first))
+    out.seek(first)
+    compressor, nodes = lazrs.LasZipCompressor(out, laszip), []
+    for key in [(-1, -1, -1), *sorted({tuple(o) for o in octant.tolist()} - {(-1, -1, -1)})]:
+        mine = np.flatnonzero((octant == key).all(axis=1))
+        before = out.tell() if nodes else first + 8
+        compressor.compress_many(rows[mine].reshape(-1))
+        compressor.finish_current_chunk()
+        name = (0, 0, 0, 0) if key[0] < 0 else (1, *key)
+        nodes.append(struct.pack("<4iQii", *name, before, out.tell() - before, len(mine)))
+    compressor.done()
+    out.seek(0, 2)
+    evlr, page = out.tell(), b"".join(nodes)
+    out.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(page), b"EPT Hierarchy") + page)
+    info = struct.pack("<5dQQ2d", *centre, half, half / 64, evlr + 60, len(page), 0.0, 0.0) + bytes(88)
+    entry = struct.pack("<H16sHH32s", 0, b"copc", 1, 160, b"COPC info VLR") + info
+    struct.pack_into("<II", head, OFFSET_TO_POINTS, first, count + 2)
+    struct.pack_into("<QI", head, EVLR_START, evlr, 1)
+    head[FORMAT] |= 0x80
+    path.write_bytes(bytes(head[:375]) + entry + records + out.getvalue()[first:])
+    return path
+
+
 def patch(path: Path, position: int, layout: str, *values: Any) -> Path:
     """Overwrite bytes at a position."""
     data = bytearray(path.read_bytes())

@@ -250,6 +250,46 @@ def test_f5_a_broken_tile_leaves_its_place_unknown_and_the_rest_is_done(three, t
     assert outputs(out) == outputs(whole)
 
 
+def test_a_file_that_is_left_out_leaves_its_place_unknown_too(three, tmp_path):
+    """Cut off in the middle, as a download that broke: the header still says where its points are."""
+    names = sorted(p.name for p in three.glob("*.laz"))
+    whole, out = tmp_path / "whole", tmp_path / "run"
+    small_plan(three, whole, filter=SHORT).run(Inline())
+    good = (three / names[2]).read_bytes()
+    (three / names[2]).write_bytes(good[: len(good) // 2])
+    with pytest.raises(SurveyError, match="1 file cannot be used"):
+        small_plan(three, out, filter=SHORT)
+    with pytest.raises(PartialRunError, match=rf"(?s)scan chunk-table \(.*{names[2]}\): .*--accept-changes"):
+        small_plan(three, out, skip_bad=True, filter=SHORT).run(Inline())
+    failure = json.loads((out / "failures.json").read_text())["failures"][0]
+    assert (failure["stage"], failure["id"], failure["files"]) == ("scan", "chunk-table", [str(three / names[2])])
+    assert failure["bounds_m"][0] == pytest.approx(800, abs=1)
+    assert not (out / "dtm.tif").exists()
+    assert (out / "dtm.partial.tif").exists()
+    known, full_store = RunStore(str(out / "run.zarr")), RunStore(str(whole / "run.zarr"))
+    records = dict(known.records("classify"))
+    assert records["c_0031_0024"]["unproven"] > 0
+    proven = [chunk for chunk, record in records.items() if record["unproven"] == 0]
+    assert proven
+    for chunk in proven:
+        np.testing.assert_equal(known.read_classification(chunk), full_store.read_classification(chunk))
+    (three / names[2]).write_bytes(good)
+    client = Inline()
+    small_plan(three, out, filter=SHORT).run(client, accept_changes=True)
+    assert not {"tile-s_000000", "tile-s_000001"} & set(client.ran)
+    assert outputs(out) == outputs(whole)
+
+
+def test_a_file_whose_place_nobody_knows_is_left_out_by_name(three, tmp_path):
+    (three / "z.laz").write_bytes(b"<html>not found</html>")
+    with pytest.raises(PartialRunError, match=r"1 pieces of work failed and 0 wait .*\n  scan signature \(.*z\.laz\)"):
+        small_plan(three, tmp_path / "run", skip_bad=True).run(Inline())
+    report = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert [(p["path"], p["code"]) for p in report["left_out"]] == [(str(three / "z.laz"), "signature")]
+    assert (tmp_path / "run" / "dtm.tif").exists()
+    assert len(list((tmp_path / "run" / "laz").iterdir())) == 3
+
+
 def test_f23_a_tile_replaced_after_the_scan_is_set_aside(three, tmp_path):
     made = small_plan(three, tmp_path / "run")
     os.utime(sorted(three.glob("*.laz"))[1], ns=(1, 1))

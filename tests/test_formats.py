@@ -5,11 +5,12 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import lasfiles
 import laspy
 import numpy as np
 import pytest
 from faulty import Inline
-from lasfiles import patch, points
+from lasfiles import patch, points, write_copc
 
 from ppdf_dask.errors import ParameterError, TileError
 from ppdf_dask.filters.pmf import PmfParams
@@ -117,17 +118,126 @@ def test_las_1_0_and_1_1(tmp_path, minor):
 
 
 def test_f20_a_copc_file_comes_out_as_plain_laz(tmp_path):
-    """There is no writer of COPC: a LAZ file with the records that mark one has to do."""
-    before = write(tmp_path / "plain.laz", 6, "1.4")
-    before.header.vlrs.insert(0, laspy.VLR("copc", 1, "COPC info VLR", bytes(160)))
-    before.evlrs.append(laspy.VLR("copc", 1000, "EPT Hierarchy", bytes(32)))
-    before.write(tmp_path / "a.copc.laz", do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
-    survey = scan([tmp_path / "a.copc.laz"])
+    """A true one, which laspy's own COPC reader finds its way through; chunks' edges lie on points of it."""
+    mm = points(4000) // 1000 * 1000
+    source = write_copc(tmp_path / "a.copc.laz", mm, crs="EPSG:2154", return_number=1, number_of_returns=1)
+    with laspy.CopcReader.open(source) as reader:
+        assert len(reader.query()) == 4000
+        assert len(reader.query(level=0)) == 400
+    before = laspy.read(source, laz_backend=laspy.LazBackend.Lazrs)
+    survey = scan([source])
     assert survey.tiles[0].copc
     assert survey.tiles[0].name == "a.laz"
-    result = plan(survey, params(), out=tmp_path / "run").run(Inline())
+    result = plan(survey, params().replace(chunks=ChunkParams(chunk_size=20.0)), out=tmp_path / "run").run(Inline())
+    assert result.counts["points"] == result.counts["eligible"] == 4000
     after = same_but_class(before, result.tiles[0])
     assert not [v for v in [*after.header.vlrs, *after.evlrs] if v.user_id == "copc"]
+    plain = tmp_path / "plain.laz"
+    before.header.vlrs.extract("CopcInfoVlr")
+    before.evlrs = None
+    before.write(plain, laz_backend=laspy.LazBackend.Lazrs)
+    again = plan(scan([plain]), params().replace(chunks=ChunkParams(chunk_size=20.0)), out=tmp_path / "plain")
+    classes = [np.asarray(laspy.read(r.tiles[0]).classification) for r in (result, again.run(Inline()))]
+    assert (classes[0] == classes[1]).all()
+
+
+def masked(head: bytes) -> bytes:
+    """Return a header without the four places that a copy has to change: where what begins, compressed or not."""
+    return head[:96] + bytes(9) + head[105:235] + bytes(12) + head[247:375]
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_f15_header_and_records_stay_to_the_byte(tmp_path, suffix):
+    """Text in Latin-1, a date of zero, reserved bytes, old counts, statistics of extra bytes: none means us."""
+    source = tmp_path / f"a{suffix}"
+    write(source, 6, "1.4")
+    raw = bytearray(source.read_bytes())
+    raw[26:58] = "Höhenmodell, Scanner Nº 7".encode("latin-1").ljust(32, b"\0")
+    raw[58:90] = bytes(range(224, 256))
+    raw[90:94] = bytes(4)
+    raw[107:131] = bytes(range(24))
+    at = raw.index(b"somebody") - 2
+    raw[at : at + 2] = b"\xbb\xaa"
+    raw[at + 2 : at + 18] = "Müller & Söhne".encode("latin-1").ljust(16, b"\xff")
+    raw[at + 22 : at + 54] = b"\xe9" * 32
+    source.write_bytes(raw)
+    assert {p.code for p in scan([source]).problems} == {"crs-missing", "legacy-count"}
+    result = plan(scan([source]), params(mode="reset"), out=tmp_path / "run").run(Inline())
+    copy = result.tiles[0].read_bytes()
+    assert masked(copy) == masked(bytes(raw))
+
+    def records(data):
+        start, count = int.from_bytes(data[96:100], "little"), int.from_bytes(data[100:104], "little")
+        found, position = [], 375
+        for _ in range(count):
+            end = position + 54 + int.from_bytes(data[position + 20 : position + 22], "little")
+            found.append(bytes(data[position:end]))
+            position = end
+        assert position == start
+        return [r for r in found if b"laszip encoded" not in r[:18]]
+
+    assert records(copy) == records(raw)
+    assert len(records(copy)) == 2
+    begin = [int.from_bytes(d[235:243], "little") for d in (raw, copy)]
+    assert copy[begin[1] :] == raw[begin[0] :]
+    assert len(copy) - begin[1] == 60 + 70_000
+    alone = classify_tile(scan([source]), tmp_path / "alone.laz", params(mode="reset"))
+    assert alone["points"] == 900
+    assert (tmp_path / "alone.laz").read_bytes() == copy
+    assert verify(tmp_path / "run").findings == []
+
+
+WAVES = b"\0\0" + b"LASF_Spec".ljust(16, b"\0") + (65535).to_bytes(2, "little") + (5000).to_bytes(8, "little")
+
+
+@pytest.mark.parametrize(("point_format", "version"), [(4, "1.3"), (5, "1.3"), (9, "1.4"), (10, "1.4")])
+def test_f15_waveforms_inside_the_file_stay_where_the_header_says(tmp_path, point_format, version):
+    source = tmp_path / "a.las"
+    waves = WAVES + bytes(32) + (np.arange(5000) % 251).astype(np.uint8).tobytes()
+    before = write(source, point_format, version)
+    raw = bytearray(source.read_bytes())
+    raw[6] |= 0b10
+    raw[227:235] = len(raw).to_bytes(8, "little")
+    if version == "1.4":  # one more record behind the points
+        raw[243:247] = (2).to_bytes(4, "little")
+    source.write_bytes(raw + waves)
+    result = plan(scan([source]), params(), out=tmp_path / "run").run(Inline())
+    copy = result.tiles[0].read_bytes()
+    at = int.from_bytes(copy[227:235], "little")
+    assert copy[at : at + 5060] == waves
+    assert copy[6] == raw[6]
+    after = laspy.read(result.tiles[0])
+    assert (all_but_class(after) == all_but_class(before)).all()
+    if version == "1.4":
+        assert [v.description for v in after.evlrs] == [NAMES[1], ""]
+
+
+@pytest.mark.parametrize(("point_format", "version"), [(4, "1.3"), (5, "1.4"), (9, "1.4"), (10, "1.4")])
+def test_f15_waveforms_compressed_by_laszip_come_out_whole(tmp_path, point_format, version):
+    before = write(tmp_path / "a.las", point_format, version)
+    before.write(tmp_path / "b.laz", do_compress=True, laz_backend=laspy.LazBackend.Laszip)
+    before = laspy.read(tmp_path / "b.laz", laz_backend=laspy.LazBackend.Laszip)
+    result = plan(scan([tmp_path / "b.laz"]), params(), out=tmp_path / "run").run(Inline())
+    assert result.tiles[0].name == "b.las"
+    same_but_class(before, result.tiles[0])
+
+
+def test_f7_f16_what_a_header_says_wrong_changes_nothing(tmp_path):
+    """Bounds that do not hold the points, and no WKT bit: warned of, and handed on as they are."""
+    source = lasfiles.write(tmp_path / "a.laz", points(800), crs="EPSG:2154")
+    right = plan(scan([source]), params(), out=tmp_path / "right").run(Inline())
+    high, low = np.array(laspy.read(source).header.maxs), np.array(laspy.read(source).header.mins)
+    patch(source, lasfiles.BOUNDS, "6d", *np.column_stack([high + 30, low + 10]).ravel())
+    patch(source, 6, "H", 0)
+    survey = scan([source])
+    assert [p.code for p in survey.problems] == ["wkt-bit"]
+    result = plan(survey, params(), out=tmp_path / "run").run(Inline())
+    assert result.tiles[0].read_bytes()[:227] == source.read_bytes()[:227]
+    for each in (right, result):
+        assert result.counts == right.counts
+        classes = np.asarray(laspy.read(each.tiles[0]).classification)
+        assert (classes == np.asarray(laspy.read(right.tiles[0]).classification)).all()
+    assert (tmp_path / "run" / "dtm.tif").read_bytes() == (tmp_path / "right" / "dtm.tif").read_bytes()
 
 
 def test_f18_every_mode_writes_what_the_table_says(tmp_path):

@@ -105,13 +105,23 @@ def test_a_byte_that_is_not_as_written_is_seen(tmp_path, monkeypatch, what):
 
 
 def test_untidy_files_are_written_in_full(tmp_path):
-    path = patch(source(tmp_path / "a.laz"), LEGACY_COUNT, "I", 7)
+    path = write(tmp_path / "a.laz", points(1000), point_format=7)
+    path.write_bytes(path.read_bytes()[:-5] + bytes(5))
     header = read_header(str(path))
-    assert [code for code, _ in header.warnings] == ["legacy-count"]
+    assert [code for code, _ in header.warnings] == ["chunk-table"]
     assert not can_relabel(header, merge.BATCH)
     merge.rewrite(job_of(path), tmp_path / "b.laz", every_third)
-    assert laspy.read(tmp_path / "b.laz").header.point_count == N
     assert read_header(str(tmp_path / "b.laz")).warnings == ()
+
+
+def test_a_wrong_old_count_is_handed_on_by_both(tmp_path, monkeypatch):
+    path = patch(source(tmp_path / "a.laz"), LEGACY_COUNT, "I", 7)
+    merge.rewrite(job_of(path), tmp_path / "quick.laz", every_third)
+    monkeypatch.setattr(merge, "can_relabel", lambda header, most: False)
+    merge.rewrite(job_of(path), tmp_path / "full.laz", every_third)
+    assert (tmp_path / "quick.laz").read_bytes() == (tmp_path / "full.laz").read_bytes()
+    assert [code for code, _ in read_header(str(tmp_path / "full.laz")).warnings] == ["legacy-count"]
+    assert laspy.read(tmp_path / "full.laz").header.point_count == N
 
 
 def test_other_formats_and_large_chunks_are_written_in_full(tmp_path):

@@ -104,3 +104,11 @@ def main() -> None:
     except PpdfError as error:
         click.echo(f"ppdf-dask: {error}", err=True)
         sys.exit(error.exit_code)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        click.echo(
+            f"ppdf-dask: {place}{error.strerror or error}; mend that and give the same command again, it goes on where "
+            "it stopped",
+            err=True,
+        )
+        sys.exit(1)

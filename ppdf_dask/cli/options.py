@@ -99,8 +99,11 @@ def run_params(options: dict[str, Any]) -> RunParams:
 def _filter(name: str, profile: str | None, table: dict[str, Any]) -> Parameters:
     from ppdf_dask import filters
 
-    base = filters.parameters(table.pop("name", name), profile or table.pop("profile", None))
-    table.pop("profile", None)
+    chosen = {"name": table.pop("name", name), "profile": table.pop("profile", None)}
+    for key, value in chosen.items():
+        if not isinstance(value, str | None):
+            raise ParameterError(f"[filter] {key} = {value!r} is not a text")
+    base = filters.parameters(chosen["name"], profile or chosen["profile"])
     return base.replace(**table)
 
 
@@ -109,8 +112,12 @@ def _config(path: Path | None) -> dict[str, Any]:
         return {}
     try:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ParameterError(f"{path} cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ParameterError(f"{path} is not valid TOML: {error}") from error
+    except RecursionError:
+        raise ParameterError(f"{path} is not valid TOML: it is nested too deeply") from None
     known = {"filter", *TABLES}
     for name, table in found.items():
         if name not in known or not isinstance(table, dict):
