@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import json
 import math
@@ -326,6 +327,7 @@ def test_sites_command_measures_the_six_sites(client, tmp_path, monkeypatch):
 
 
 def test_terrestrial_is_passed_on(tmp_path, monkeypatch):
+    from ppdf_dask import synthetic
     from ppdf_dask.experiments import terrestrial
     from ppdf_dask.experiments.terrestrial import KINDS, METHODS, ThesisTable, Tuned
 
@@ -333,6 +335,8 @@ def test_terrestrial_is_passed_on(tmp_path, monkeypatch):
         rows = [Tuned(kind, m, METHODS[m](), Scores(1000, 2000, 0, 15)) for kind in KINDS for m in METHODS]
         return ThesisTable(tuple(rows), tuning_seed, tuple(seeds))
 
+    small = functools.partial(synthetic.terrestrial_plot, edge=6.0, density=40.0)
+    monkeypatch.setattr(synthetic, "terrestrial_plot", small)
     monkeypatch.setattr(terrestrial, "thesis_table", table)
     words = ["compare", "terrestrial", "--seeds", "4,5", "--tuning-seed", "6", "--out", str(tmp_path)]
     shown = CliRunner().invoke(group, words)
@@ -344,5 +348,6 @@ def test_terrestrial_is_passed_on(tmp_path, monkeypatch):
     assert len(lines) == 5 * 2
     assert float(lines[0]["kappa"]) == pytest.approx(98.88, abs=0.005)
     assert (tmp_path / "figures" / "terrestrial.svg").is_file()
+    assert all((tmp_path / "figures" / f"terrestrial-{kind}-removed.png").is_file() for kind in KINDS)
     bad = CliRunner().invoke(group, ["compare", "terrestrial", "--seeds", "4,x"])
     assert "whole numbers" in str(bad.exception)

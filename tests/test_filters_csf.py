@@ -1,4 +1,4 @@
-"""CSF through its library: silent, repeatable, with clear errors."""
+"""CSF through its library: what a plain reading of the method gives, silent, repeatable, with clear errors."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 from classic_clouds import cloud_of
+from oracle_csf import margins
 
 from ppdf_dask.errors import ParameterError, PpdfError
 from ppdf_dask.filters import csf
@@ -24,6 +25,40 @@ def scene(seed=1):
     bank = np.clip(xy[:, 0] - 20_000, 0, 4000)
     house = (abs(xy[:, 0] - 10_000) < 4000) & (abs(xy[:, 1] - 20_000) < 4000)
     return np.column_stack([xy, bank + np.where(house, 5000, 0)]), house
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"slope_smooth": False},
+        {"rigidness": 1, "threshold": 0.2, "time_step": 0.9},
+        {"rigidness": 2, "iterations": 30},
+        {"resolution": 0.5},
+        {"resolution": 0.5, "slope_smooth": False},
+    ],
+    ids=str,
+)
+def test_oracle(values):
+    rng = np.random.default_rng(len(str(values)))
+    xy = rng.integers(0, 14_000, (600, 2))
+    bank = np.clip(xy[:, 0] - 8_000, 0, 3_000)
+    house = (abs(xy[:, 0] - 4_000) < 2_000) & (abs(xy[:, 1] - 6_000) < 2_500)
+    pts = np.column_stack([xy, bank + np.where(house, 5_000, 0) + rng.integers(0, 300, len(xy))])
+    # In the order in which ours hands them over: of equally near points the first carries the cloth.
+    pts = pts[np.lexsort((pts[:, 2], pts[:, 1], pts[:, 0]))]
+    params = CsfParams(**values)
+    metres = ((pts - pts.min(axis=0)) / 1000).tolist()
+    inside = np.array(margins(metres, params))
+    sure = np.abs(inside) > 1e-9
+    assert sure.sum() > 590
+    ground = classify(cloud_of(pts), params).ground
+    assert 0.2 < ground.mean() < 0.9
+    assert (ground == (inside > 0))[sure].all()
+    if params == CsfParams(resolution=0.5):
+        # The cloth that hangs over the bank is large enough to be let down here.
+        rough = np.array(margins(metres, params.replace(slope_smooth=False)))
+        assert ((rough > 0) != (inside > 0)).any()
 
 
 def test_a_house_is_removed_and_the_land_kept():

@@ -22,7 +22,7 @@ def plot(kind, seed):
     k = 2 + seed % 2
     stump = (x // 0.5 == k) & (y // 0.5 == 2)
     z = {"flat": 0.0, "slope": 0.1, "complex": 0.2}[kind] * x + 0.005 + 0.6 * stump
-    return np.column_stack([x, y, z]), ~stump
+    return np.column_stack([x, y, z]), np.where(stump, 2, 0).astype(np.int8)
 
 
 @pytest.fixture
@@ -47,8 +47,14 @@ def test_each_method_is_tuned_on_one_plot_and_scored_on_others(small_grid):
     # at 0.1 m all of the stump stays; at 0.2 m 2 x 2 voxels of 10 x 10 points, the other columns see ground beside it
     assert table.row("flat", "3D Forest").params.resolution == 0.2
     assert table.row("flat", "3D Forest").scores == Scores(c=2 * (22500 - 625), d=2 * 625, a=0, b=2 * 400)
+    assert flat.kept["stump"] == (0, 2 * 625)
+    assert table.row("flat", "3D Forest").kept["stump"] == (2 * 400, 2 * 625)
+    assert flat.kept["ground"] == (2 * (22500 - 625),) * 2
+    assert "| Flat, 3D Forest | 100.00 | - | 64.00 | - | - |" in table.markdown()
     best = {
-        m: min(candidates(m), key=lambda p: Scores.from_masks(plot("complex", 0)[1], classified("complex", p)).total)
+        m: min(
+            candidates(m), key=lambda p: Scores.from_masks(plot("complex", 0)[1] == 0, classified("complex", p)).total
+        )
         for m in METHODS
     }
     assert {m: table.row("complex", m).params for m in METHODS} == best
@@ -88,8 +94,8 @@ def test_the_table_has_the_thesis_layout_and_its_statistics():
 
 
 def test_the_picture_shows_what_pcom_removes():
-    xyz, truth = plot("flat", 0)
-    axes = terrestrial.removed_figure(xyz, truth, VoxelParams(), PcomParams())
+    xyz, thing = plot("flat", 0)
+    axes = terrestrial.removed_figure(xyz, thing == 0, VoxelParams(), PcomParams())
     shown = {
         to_hex(c.get_facecolor()[0]).upper(): len(c.get_offsets()) for c in axes.collections if len(c.get_offsets())
     }

@@ -17,6 +17,7 @@ from ppdf_dask.errors import ParameterError, PartialRunError, SurveyError
 
 if TYPE_CHECKING:
     from distributed import Client
+    from matplotlib.axes import Axes
 
     from ppdf_dask.events import Listener
     from ppdf_dask.experiments.workers import SiteFile
@@ -164,7 +165,8 @@ def _site_maps(out: Path, records: Sequence[dict[str, Any]]) -> None:
 
 def _terrestrial(out: Path | None, seeds: Sequence[int], tuning_seed: int, as_json: bool) -> None:
     from ppdf_dask.experiments.reports import csv_text
-    from ppdf_dask.experiments.terrestrial import thesis_table, total_error_figure
+    from ppdf_dask.experiments.terrestrial import removed_figure, thesis_table, total_error_figure
+    from ppdf_dask.synthetic import terrestrial_plot
 
     table = thesis_table(seeds, tuning_seed=tuning_seed)
     if out is not None:
@@ -175,10 +177,18 @@ def _terrestrial(out: Path | None, seeds: Sequence[int], tuning_seed: int, as_js
             for method, values in methods.items()
         ]
         _write(out, TERRESTRIAL, table.markdown(), csv_text(["data", "method", *rates], lines), table.as_dict())
-        figure = total_error_figure(table).get_figure(root=True)
-        assert figure is not None
-        save(figure, out / "figures" / TERRESTRIAL)
+        _saved(total_error_figure(table), out / "figures" / TERRESTRIAL)
+        for kind in table.kinds:
+            plain, clustered = (table.row(kind, method).params for method in ("3D Forest", "PCOM"))
+            drawn = removed_figure(*terrestrial_plot(kind, seeds[0]), plain, clustered)
+            _saved(drawn, out / "figures" / f"{TERRESTRIAL}-{kind}-removed")
     show(table, as_json=as_json)
+
+
+def _saved(axes: Axes, name: Path) -> None:
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    save(figure, name)
 
 
 def _write(out: Path, name: str, text: str, lines: str, values: dict[str, Any]) -> None:

@@ -7,8 +7,8 @@ the same resolutions, the same criterion (total error), on plots that are not sc
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,13 +20,13 @@ from ppdf_dask.filters.cloud import Bools, Cloud, cloud_from_xyz
 from ppdf_dask.filters.pcom import PcomParams
 from ppdf_dask.filters.voxel import VoxelParams
 from ppdf_dask.metrics import Scores, mean_std, pooled
-from ppdf_dask.synthetic.terrestrial import Kind, terrestrial_plot
+from ppdf_dask.synthetic.terrestrial import THINGS, Kind, terrestrial_things
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Plot = Callable[[Kind, int], tuple[npt.NDArray[np.float64], Bools]]
-"""``plot(kind, seed)``: points (n, 3) in metres and which of them are ground."""
+Plot = Callable[[Kind, int], tuple[npt.NDArray[np.float64], npt.NDArray[np.int8]]]
+"""``plot(kind, seed)``: points (n, 3) in metres and what each belongs to, its number in `THINGS`; 0 is ground."""
 
 KINDS: tuple[Kind, ...] = ("flat", "slope", "complex")
 RESOLUTIONS = (0.04, 0.06, 0.1, 0.16, 0.24)
@@ -54,12 +54,15 @@ class Tuned:
         The best of the grid on the tuning plot.
     scores : Scores
         With these, all scored plots of the kind pooled.
+    kept : mapping of str to (int, int)
+        For each of `THINGS`: how many of its points the method takes for ground, and how many it has.
     """
 
     kind: Kind
     method: str
     params: VoxelParams
     scores: Scores
+    kept: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,7 @@ class ThesisTable:
             "percent": self.lines(),
             "counts": {f"{r.kind} {r.method}": {k: getattr(r.scores, k) for k in "cdab"} for r in self.rows},
             "params": {f"{r.kind} {r.method}": r.params.as_dict() for r in self.rows},
+            "kept": {f"{r.kind} {r.method}": {k: list(v) for k, v in r.kept.items()} for r in self.rows},
             "grid": {
                 "resolution": list(RESOLUTIONS),
                 "min_area": list(MIN_AREAS),
@@ -135,8 +139,21 @@ class ThesisTable:
             f"over the lines. Parameters with the lowest total error on the plot of seed {self.tuning_seed} among "
             f"resolutions {_listed(RESOLUTIONS)} m (both), smallest areas {_listed(MIN_AREAS)} m2 and tolerances "
             f"{_listed(TOLERANCES)} voxels (PCOM). Chosen: {chosen}.",
+            "",
+            *self._kept(),
         ]
         return "\n".join(out)
+
+    def _kept(self) -> list[str]:
+        """Return a table of the share of each thing's points that each method takes for ground."""
+        things = list(self.rows[0].kept)
+        if not things:
+            return []
+        out = ["| Taken for ground, % | " + " | ".join(things) + " |", "|---" + "|---:" * len(things) + "|"]
+        for r in self.rows:
+            shares = (f"{100 * kept / n:.2f}" if n else "-" for kept, n in r.kept.values())
+            out.append(f"| {r.kind.capitalize()}, {r.method} | " + " | ".join(shares) + " |")
+        return out
 
 
 def _listed(values: Sequence[float]) -> str:
@@ -186,7 +203,7 @@ def classify(cloud: Cloud, params: VoxelParams) -> Bools:
 
 
 def thesis_table(
-    seeds: Sequence[int] = (1, 2, 3), *, tuning_seed: int = 0, plot: Plot = terrestrial_plot
+    seeds: Sequence[int] = (1, 2, 3), *, tuning_seed: int = 0, plot: Plot = terrestrial_things
 ) -> ThesisTable:
     """Compare PCOM with 3D Forest's voxel filter on plots with known ground.
 
@@ -197,7 +214,8 @@ def thesis_table(
     tuning_seed : int
         Plot to choose the parameters on; not one of `seeds`, so that no method is scored on what it was tuned on.
     plot : callable
-        ``plot(kind, seed)``: points (n, 3) and ground mask, for each kind in `KINDS`; default: the synthetic plots.
+        ``plot(kind, seed)``: points (n, 3) and what they belong to, for each kind in `KINDS`; default: the synthetic
+        plots.
 
     Returns
     -------
@@ -220,17 +238,25 @@ def thesis_table(
         )
     rows = []
     for kind in KINDS:
-        xyz, truth = plot(kind, tuning_seed)
+        xyz, thing = plot(kind, tuning_seed)
         tuning = cloud_from_xyz(xyz)
-        best = {m: _best(tuning, truth, candidates(m)) for m in METHODS}
+        best = {m: _best(tuning, thing == 0, candidates(m)) for m in METHODS}
         scores: dict[str, list[Scores]] = {m: [] for m in METHODS}
+        kept = {m: np.zeros((len(THINGS), 2), np.int64) for m in METHODS}
         for seed in seeds:
-            xyz, truth = plot(kind, seed)
+            xyz, thing = plot(kind, seed)
             cloud = cloud_from_xyz(xyz)
             for m in METHODS:
-                scores[m].append(Scores.from_masks(truth, classify(cloud, best[m])))
-        rows += [Tuned(kind, m, best[m], pooled(scores[m])) for m in METHODS]
+                found = classify(cloud, best[m])
+                scores[m].append(Scores.from_masks(thing == 0, found))
+                for column, mask in enumerate((found, np.ones_like(found))):
+                    kept[m][:, column] += np.bincount(thing[mask], minlength=len(THINGS))
+        rows += [Tuned(kind, m, best[m], pooled(scores[m]), _by_thing(kept[m])) for m in METHODS]
     return ThesisTable(tuple(rows), tuning_seed, tuple(seeds))
+
+
+def _by_thing(counts: npt.NDArray[np.int64]) -> dict[str, tuple[int, int]]:
+    return {name: (int(kept), int(n)) for name, (kept, n) in zip(THINGS, counts, strict=True)}
 
 
 def _best(cloud: Cloud, truth: Bools, choice: list[VoxelParams]) -> VoxelParams:

@@ -12,7 +12,11 @@ from ppdf_dask.errors import ParameterError
 from ppdf_dask.synthetic._noise import noise
 
 Kind = Literal["flat", "slope", "complex"]
+THINGS = ("ground", "stem", "stump", "shrub", "outlier")
+"""What a point of a plot belongs to; branches count as stem."""
+
 _EYE = 1.6
+_STUMP = 3.0
 _FULL_DENSITY_RANGE = 5.0
 _RANGE_NOISE = 0.004
 
@@ -77,24 +81,43 @@ def terrestrial_plot(
     >>> xyz.shape[1], bool(0.1 < ground.mean() < 0.9)
     (3, True)
     """
+    xyz, thing = terrestrial_things(kind, seed, edge=edge, density=density)
+    return xyz, thing == 0
+
+
+def terrestrial_things(
+    kind: Kind = "flat", seed: int = 1, *, edge: float = 16.0, density: float = 800.0
+) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    """Return the scan of `terrestrial_plot`, and what each point belongs to: its number in `THINGS`, 0 the ground.
+
+    Examples
+    --------
+    >>> xyz, thing = terrestrial_things("flat", seed=3, edge=8.0, density=100.0)
+    >>> [name for k, name in enumerate(THINGS) if (thing == k).any()]
+    ['ground', 'stem', 'stump', 'shrub', 'outlier']
+    """
     if kind not in get_args(Kind):
         raise ParameterError(f"kind = {kind!r} is unknown; choose 'flat', 'slope' or 'complex'")
     if not (5.0 <= edge <= 50.0 and 10.0 <= density <= 5000.0):
         raise ParameterError(f"edge = {edge} m must be 5 to 50 and density = {density} points/m2 10 to 5000")
     rng = np.random.default_rng(seed)
     scene = _scene(kind, seed, edge, rng)
+    terrain = _ground_points(scene, edge, density, rng)
+    wood, of_stem = _cylinder_points(scene, density, rng)
+    leaves = _shrub_points(scene, density, rng)
     surfaces = [
-        _ground_points(scene, edge, density, rng),
-        _cylinder_points(scene, density, rng),
-        _shrub_points(scene, density, rng),
+        (terrain, np.zeros(len(terrain), np.int8)),
+        (wood, np.where(of_stem, 1, 2).astype(np.int8)),
+        (leaves, np.full(len(leaves), 3, np.int8)),
     ]
-    seen = [s[_visible(s, scene, rng.random(len(s)))] for s in surfaces]
-    stray = _outliers(scene, edge, len(seen[0]), rng)
-    ground = np.zeros(sum(map(len, seen)) + len(stray), np.bool_)
-    ground[: len(seen[0])] = True
-    xyz = np.concatenate([*seen, stray])
+    masks = [_visible(points, scene, rng.random(len(points))) for points, _ in surfaces]
+    stray = _outliers(scene, edge, int(masks[0].sum()), rng)
+    xyz = np.concatenate([*(points[mask] for (points, _), mask in zip(surfaces, masks, strict=True)), stray])
+    thing = np.concatenate(
+        [*(what[mask] for (_, what), mask in zip(surfaces, masks, strict=True)), np.full(len(stray), 4, np.int8)]
+    )
     order = rng.permutation(len(xyz))
-    return np.round(xyz[order], 3), ground[order]
+    return np.round(xyz[order], 3), thing[order]
 
 
 def _scene(kind: str, seed: int, edge: float, rng: np.random.Generator) -> _Scene:
@@ -128,9 +151,14 @@ def _ground_points(scene: _Scene, edge: float, density: float, rng: np.random.Ge
     return np.column_stack([xy, _heights(xy, scene) + _jitter(len(xy), rng)])
 
 
-def _cylinder_points(scene: _Scene, density: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return points on the sides and tops of stems and stumps; stems taper and carry short dead branches."""
-    parts = []
+def _cylinder_points(
+    scene: _Scene, density: float, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return points on the sides and tops of stems and stumps, and which are a stem's.
+
+    Stems taper and carry short dead branches.
+    """
+    parts, of_stem = [np.empty((0, 3))], [np.empty(0, np.bool_)]
     for x, y, radius, top in scene.cylinders:
         foot = _heights(np.array([[x, y]]), scene)[0]
         n = round(2.0 * np.pi * radius * top * density)
@@ -144,12 +172,14 @@ def _cylinder_points(scene: _Scene, density: float, rng: np.random.Generator) ->
         angle, r = rng.uniform(0.0, 2.0 * np.pi, n), radius * np.sqrt(rng.random(n))
         cap = np.column_stack([x + r * np.cos(angle), y + r * np.sin(angle), foot + top + _jitter(n, rng)])
         parts += [side, cap]
-        if top > 3.0:
+        of_stem.append(np.full(len(side) + len(cap), top > _STUMP))
+        if top > _STUMP:
             n = round(0.15 * density)
             angle, r = np.repeat(rng.uniform(0.0, 2.0 * np.pi, 8), n // 8), rng.uniform(radius, 0.9, n // 8 * 8)
             up = np.repeat(rng.uniform(1.5, top, 8), n // 8) - 0.2 * r
             parts.append(np.column_stack([x + r * np.cos(angle), y + r * np.sin(angle), foot + up]))
-    return np.concatenate([np.empty((0, 3)), *parts])
+            of_stem.append(np.ones(len(up), np.bool_))
+    return np.concatenate(parts), np.concatenate(of_stem)
 
 
 def _shrub_points(scene: _Scene, density: float, rng: np.random.Generator) -> NDArray[np.float64]:
