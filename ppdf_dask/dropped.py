@@ -10,6 +10,9 @@ from ppdf_dask.ledger import Ledger, digest
 from ppdf_dask.lock import hold
 from ppdf_dask.store import RunStore
 
+POINTS = ("chunks", "labels")
+"""Groups of the store that hold what was cut from the tiles."""
+
 if TYPE_CHECKING:
     from ppdf_dask.stages import Cutting
 
@@ -29,10 +32,12 @@ def drop_points(out: Path) -> int:
         records = Ledger(store).done("tile", inputs.tile_keys)
         density = Cutting(inputs, store, records).density
         kept = {"tiles": _key(records), "density": [density.points, density.cells]}
-        freed = sum(f.stat().st_size for f in (out / "run.zarr" / "chunks").rglob("*") if f.is_file())
+        gone = [out / "run.zarr" / group for group in POINTS]
+        freed = sum(f.stat().st_size for folder in gone for f in folder.rglob("*") if f.is_file())
         # Known first, gone later: a run that is stopped in between cuts the tiles again when it needs them.
         store.put_record("dropped", "points", kept)
-        store.drop("chunks")
+        for group in POINTS:
+            store.drop(group)
     return freed
 
 

@@ -29,9 +29,12 @@ class Index:
     ----------
     chunks : dict
         Chunk id to its parts.
+    labels : dict
+        Source to the number of its batches of labels.
     """
 
     chunks: dict[str, Parts] = field(default_factory=dict)
+    labels: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, tiles: dict[str, dict[str, Any]]) -> Index:
@@ -51,7 +54,7 @@ class Index:
                 for part, count in (("core", core), ("buffer", buffer)):
                     if count:
                         parts[part][source] = (count, record["fingerprint"])
-        return cls(dict(sorted(chunks.items())))
+        return cls(dict(sorted(chunks.items())), {s: record.get("labels", 0) for s, record in tiles.items()})
 
     @property
     def points(self) -> dict[str, int]:
@@ -86,6 +89,9 @@ class Index:
         owners = self.points
         for group in ("classification", "ground"):
             yield from (f"{group}/{chunk}" for chunk in store.children(group) if chunk not in owners)
+        for source in store.children("labels"):
+            kept = store.children(f"labels/{source}")
+            yield from (f"labels/{source}/{name}" for name in kept if int(name) >= self.labels.get(source, 0))
         for chunk in store.chunks():
             if chunk not in self.chunks:
                 yield f"chunks/{chunk}"

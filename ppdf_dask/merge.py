@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,28 +21,31 @@ import numpy.typing as npt
 
 from ppdf_dask.classes import LEGACY_FORMATS, Bytes, check_writable, new_classes
 from ppdf_dask.errors import StoreError, TileError
+from ppdf_dask.kept import Groups, kept_labels
 from ppdf_dask.lascopy import Surroundings
 from ppdf_dask.lasheader import RECORD_LENGTHS, Header, Reject, read_header
 from ppdf_dask.reader import (
     ALL,
     BATCH,
-    BATCH_BYTES,
     CLASSES,
     FLAGS,
     PLACES,
     Batch,
     Decoder,
+    Labels,
+    at_once,
     header_of,
     records,
     tile_records,
 )
-from ppdf_dask.relabel import can_relabel, differs, relabel
+from ppdf_dask.relabel import can_relabel, differs, relabel, whole_chunks
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiler import TileJob, owners
 from ppdf_dask.tiles import shown
 
 Bools = npt.NDArray[np.bool_]
 GroundOf = Callable[[Batch], Bools]
+Kept = Iterable[tuple[Labels, Bools]]
 
 
 @dataclass(frozen=True)
@@ -57,22 +60,30 @@ class MergeJob:
         Path of the classified file.
     made_by : str or None
         Fingerprint the classifications must carry; None: any.
+    labels : int
+        Batches of labels the tiler kept; 0: the file is decoded again.
+    cut_by : str
+        Fingerprint the labels must carry.
     """
 
     tile: TileJob
     target: str
     made_by: str | None = None
+    labels: int = 0
+    cut_by: str = ""
 
 
 def write_tile(store: RunStore, job: MergeJob) -> dict[str, Any]:
     """Write one classified tile of a run; see `rewrite`."""
     masks = _Masks(store, job.tile, job.made_by)
-    record = rewrite(job.tile, Path(job.target), masks.ground)
+    kept = kept_labels(store, job.tile.source, job.labels, job.cut_by)
+    labelled = ((labels, masks.of(labels.eligible, groups)) for labels, groups in kept)
+    record = rewrite(job.tile, Path(job.target), masks.ground, labelled if job.labels else None)
     masks.check_used_up()
     return record
 
 
-def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
+def rewrite(job: TileJob, target: Path, ground_of: GroundOf, kept: Kept | None = None) -> dict[str, Any]:
     """Copy a file with new classes.
 
     Parameters
@@ -83,6 +94,9 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
         The result; LAS when its name ends in ``.las``, else LAZ.
     ground_of : callable
         Gives for each batch, in file order, the mask of its points found ground.
+    kept : iterable, optional
+        Labels of all points, in batches of whole chunks (`whole_chunks`), and the mask of each batch; for files that
+        `can_relabel`, which need not be decoded again then.
 
     Returns
     -------
@@ -100,8 +114,8 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf) -> dict[str, Any]:
     header, compress = header_of(job.tile), target.suffix != ".las"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        if compress and can_relabel(header, _at_once(header)):
-            meant = _relabel(job, header, part, ground_of)
+        if compress and can_relabel(header, at_once(header)):
+            meant = _relabel(job, header, part, kept or _decoded(job, header, ground_of))
         else:
             meant = _copy(job, header, part, ground_of, compress=compress)
         job.tile.check_unchanged()
@@ -138,6 +152,13 @@ class _Histogram:
         if records is not None:
             self.records = zlib.crc32(np.ascontiguousarray(records).view(np.uint8).data, self.records)
 
+    def give(self, labels: Labels, ground: Bools, job: TileJob) -> Bytes:
+        """Return the new classes of the next points of a file, and count them."""
+        classes = new_classes(labels.classification, labels.eligible, ground, job.params.classes)
+        self.changed += int((classes != labels.classification).sum())
+        self.add(classes)
+        return classes
+
     def record(self) -> dict[str, Any]:
         histogram = {str(k): int(self.classes[k]) for k in np.flatnonzero(self.classes)}
         return {"points": self.points, "changed": self.changed, "classes": histogram}
@@ -153,47 +174,33 @@ class _Histogram:
             raise _not_as_written(job, part, f"{found.points} of {self.points} points")
 
 
-class _Labels:
-    """Gives records their classes and keeps count of them."""
-
-    def __init__(self, job: TileJob, header: Header, ground_of: GroundOf) -> None:
-        self._decoder = Decoder.make(header, (job.unit_xy, job.unit_z), job.params.classes, job.params.returns)
-        self._job, self._ground_of, self.meant = job, ground_of, _Histogram()
-
-    def of(self, records: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-        """Return the classes of the next records of the file."""
-        batch = self._decoder.measure(records, self.meant.points, heights=False)
-        classes = new_classes(batch.classification, batch.eligible, self._ground_of(batch), self._job.params.classes)
-        self.meant.changed += int((classes != batch.classification).sum())
-        self.meant.add(classes)
-        return classes
+def _decoder(job: TileJob, header: Header) -> Decoder:
+    return Decoder.make(header, (job.unit_xy, job.unit_z), job.params.classes, job.params.returns)
 
 
-def _relabel(job: TileJob, header: Header, part: Path, ground_of: GroundOf) -> _Histogram:
+def _decoded(job: TileJob, header: Header, ground_of: GroundOf) -> Kept:
+    """Decode a file again, without heights."""
+    decoder, start = _decoder(job, header), 0
+    for raw in tile_records(job.tile, header, whole_chunks(header, at_once(header)), PLACES | CLASSES | FLAGS):
+        batch = decoder.measure(np.frombuffer(raw, decoder.dtype), start, heights=False)
+        start += batch.n
+        yield batch.labels, ground_of(batch)
+
+
+def _relabel(job: TileJob, header: Header, part: Path, kept: Kept) -> _Histogram:
     """Replace the layer of classes, then look at what was written: its bytes, and the classes as they decode."""
-    assert header.laszip is not None
-    assert header.laszip.chunk_size is not None
-    labels = _Labels(job, header, ground_of)
-    dtype = np.dtype((np.void, header.record_length))
-    size = _at_once(header) // header.laszip.chunk_size * header.laszip.chunk_size
-    raw = (np.frombuffer(data, dtype) for data in tile_records(job.tile, header, size, PLACES | CLASSES | FLAGS))
-    relabel(job.tile.path, header, part, ((some, labels.of(some)) for some in raw))
+    meant = _Histogram()
+    relabel(job.tile.path, header, part, ((labels, meant.give(labels, ground, job)) for labels, ground in kept))
     trouble = differs(job.tile.path, header, part)
     if trouble:
         raise _not_as_written(job, part, trouble)
-    labels.meant.check(job, part, whole=False)
-    return labels.meant
-
-
-def _at_once(header: Header) -> int:
-    """Return how many points the reader gives at a time at most."""
-    return min(BATCH, BATCH_BYTES // header.record_length)
+    meant.check(job, part, whole=False)
+    return meant
 
 
 def _copy(job: TileJob, header: Header, part: Path, ground_of: GroundOf, *, compress: bool) -> _Histogram:
     """Decode and encode all points, carry over the bytes around them, decode what was written and compare."""
-    labels = _Labels(job, header, ground_of)
-    meant = labels.meant
+    decoder, meant = _decoder(job, header), _Histogram()
     with open(job.tile.path, "rb") as source, part.open("w+b") as out:
         around = Surroundings.of(source, header)
         meant.around = around.checksum(source)
@@ -202,7 +209,8 @@ def _copy(job: TileJob, header: Header, part: Path, ground_of: GroundOf, *, comp
         writer = None if vlr is None else lazrs.LasZipCompressor(out, vlr)
         for raw in tile_records(job.tile, header, BATCH, ALL):
             packed = np.frombuffer(raw, np.uint8)
-            _set_classes(packed, labels.of(packed.view((np.void, header.record_length))), header)
+            batch = decoder.measure(packed.view(decoder.dtype), meant.points, heights=False)
+            _set_classes(packed, meant.give(batch.labels, ground_of(batch), job), header)
             _ = out.write(packed.data) if writer is None else writer.compress_many(packed)
             meant.records = zlib.crc32(packed.data, meant.records)
         if writer is not None:
@@ -272,10 +280,15 @@ class _Masks:
         self._used: dict[str, int] = {}
 
     def ground(self, batch: Batch) -> Bools:
-        found = np.zeros(batch.n, np.bool_)
-        seen = np.flatnonzero(batch.eligible)
-        for ix, iy, index in owners(self._job.grid, batch.x[seen], batch.y[seen]):
-            chunk = self._job.grid.chunk(ix, iy).id
+        """Return the mask of a batch, whose points say where they lie."""
+        grid, seen = self._job.grid, batch.eligible
+        groups = [(grid.chunk(ix, iy).id, index) for ix, iy, index in owners(grid, batch.x[seen], batch.y[seen])]
+        return self.of(seen, groups)
+
+    def of(self, eligible: Bools, groups: Groups) -> Bools:
+        """Return the mask of a batch, whose eligible points are grouped by the chunks that own them."""
+        seen = np.zeros(int(eligible.sum()), np.bool_)
+        for chunk, index in groups:
             if chunk not in self._masks:
                 masks = self._store.read_classification(chunk, self._made_by)
                 self._masks[chunk] = masks.get(self._job.source, np.zeros(0, np.bool_))
@@ -284,7 +297,9 @@ class _Masks:
             self._used[chunk] = end = begin + len(index)
             if end > len(self._masks[chunk]):
                 raise self._mismatch(chunk)
-            found[seen[index]] = self._masks[chunk][begin:end]
+            seen[index] = self._masks[chunk][begin:end]
+        found = np.zeros(len(eligible), np.bool_)
+        found[eligible] = seen
         return found
 
     def check_used_up(self) -> None:

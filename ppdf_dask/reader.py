@@ -39,6 +39,29 @@ _INT64 = 2**62
 
 
 @dataclass(frozen=True)
+class Labels:
+    """What the new classes of consecutive points depend on, and how they are compressed (`ppdf_dask.relabel`).
+
+    Attributes
+    ----------
+    returns, flags, classification : ndarray of uint8, shape (n,)
+        Bytes 14 and 15 of each record, and its class.
+    eligible : ndarray of bool, shape (n,)
+        Seen by the filter.
+    """
+
+    returns: Bytes
+    flags: Bytes
+    classification: Bytes
+    eligible: Bools
+
+    @property
+    def n(self) -> int:
+        """Number of points."""
+        return len(self.returns)
+
+
+@dataclass(frozen=True)
 class Batch:
     """Consecutive points of a file.
 
@@ -52,6 +75,8 @@ class Batch:
         Seen by the filter; ground from the start (mode ``"refine"``).
     classification : ndarray of uint8, shape (n,)
         Classes as read.
+    returns, flags : ndarray of uint8, shape (n,)
+        Bytes 14 and 15 of each record.
     no_returns, odd_returns : int
         Points with return numbers 0 of 0, and with impossible ones.
     """
@@ -63,6 +88,8 @@ class Batch:
     eligible: Bools
     fixed: Bools
     classification: Bytes
+    returns: Bytes
+    flags: Bytes
     no_returns: int
     odd_returns: int
 
@@ -70,6 +97,11 @@ class Batch:
     def n(self) -> int:
         """Number of points."""
         return len(self.x)
+
+    @property
+    def labels(self) -> Labels:
+        """What new classes depend on, without the places."""
+        return Labels(self.returns, self.flags, self.classification, self.eligible)
 
 
 def batches(
@@ -181,7 +213,9 @@ class Decoder:
         none, odd = odd_returns(dims)
         x, y = self.axes[0].to_mm(points["X"]), self.axes[1].to_mm(points["Y"])
         z = self.axes[2].to_mm(points["Z"] if heights else points["Z"][:0])
-        return Batch(start, x, y, z, seen, fixed_ground(classes, seen, self.rules), classes, none, odd)
+        fixed = fixed_ground(classes, seen, self.rules)
+        returns, flags = points["returns"].copy(), points["first"].copy()
+        return Batch(start, x, y, z, seen, fixed, classes, returns, flags, none, odd)
 
 
 @dataclass(frozen=True)
@@ -264,6 +298,11 @@ def _record_dtype(header: Header) -> np.dtype[Any]:
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": header.record_length})
 
 
+def at_once(header: Header) -> int:
+    """Return how many points are decoded at a time at most."""
+    return max(1, min(BATCH, BATCH_BYTES // header.record_length))
+
+
 def tile_records(tile: Tile, header: Header, size: int, wanted: int) -> Iterator[bytearray]:
     """Decode the packed records of a tile, see `records`; a tile that changes meanwhile is refused."""
     try:
@@ -297,7 +336,7 @@ def records(path: str, header: Header, size: int, wanted: int) -> Iterator[bytea
     """
     if header.point_count == 0:
         return
-    size = max(1, min(size, BATCH_BYTES // header.record_length))
+    size = min(size, at_once(header))
     with open(path, "rb") as file:
         if header.laszip is not None:
             _check_chunks(path, file, header, header.laszip)

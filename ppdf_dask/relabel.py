@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -21,18 +21,21 @@ import numpy.typing as npt
 from ppdf_dask.errors import TileError
 from ppdf_dask.lasheader import Header, Reject, read_header
 from ppdf_dask.layers import CLASSES, LayeredChunk, chunks
+from ppdf_dask.reader import Labels
 from ppdf_dask.tiles import shown
 
 Bytes = npt.NDArray[np.uint8]
-Labelled = Iterable[tuple[npt.NDArray[Any], Bytes]]
-"""Packed records of a file, in order, with the classes to write; whole chunks at a time."""
+Labelled = Iterable[tuple[Labels, Bytes]]
+"""All points of a file, in order, with the classes to write; whole chunks at a time."""
 
 _LAYERED = (6, 7, 8)
-_RETURNS, _FLAGS, _CLASS = 14, 15, 16
-"""Bytes of a record of point formats 6 to 10 (LAS 1.4 R15, table 15)."""
+_RETURNS, _FLAGS, _CLASS, _POINT14 = 14, 15, 16, 30
+"""Bytes of a record of point formats 6 to 10 and its length without colours (LAS 1.4 R15, table 15)."""
 
-_CHANNEL = 0b0011_0000
-_POINT14, _LAYERS = 30, 9
+CHANNEL = 0b0011_0000
+"""Bits of the flags that tell the scanner channel."""
+
+_LAYERS = 9
 _EVLR_START = 235
 """Byte of the header that says where the EVLRs begin (LAS 1.4 R15, table 3)."""
 
@@ -59,6 +62,13 @@ def can_relabel(header: Header, most_points: int) -> bool:
     return usual and tidy and apart and header.point_count > 0 and laszip.chunk_size <= most_points
 
 
+def whole_chunks(header: Header, most: int) -> int:
+    """Return the points of as many whole chunks as hold at most so many."""
+    assert header.laszip is not None
+    assert header.laszip.chunk_size is not None
+    return most // header.laszip.chunk_size * header.laszip.chunk_size
+
+
 def relabel(source: str, header: Header, target: Path, labelled: Labelled) -> None:
     """Write a file again with new classes.
 
@@ -69,7 +79,7 @@ def relabel(source: str, header: Header, target: Path, labelled: Labelled) -> No
     target : Path
         The new file.
     labelled : iterable
-        All records with their classes.
+        All points with their classes.
 
     Raises
     ------
@@ -83,9 +93,9 @@ def relabel(source: str, header: Header, target: Path, labelled: Labelled) -> No
     with open(source, "rb") as old, target.open("wb") as new:
         new.write(old.read(header.offset_to_points) + bytes(8))
         heads, table = _chunks(old, header, source), []
-        for records, classes in labelled:
+        for labels, classes in labelled:
             firsts = classes[:: laszip.chunk_size]
-            for first, layer in zip(firsts, _class_layers(header, records, classes), strict=True):
+            for first, layer in zip(firsts, _class_layers(header, labels, classes), strict=True):
                 chunk = next(heads)
                 size = new.write(_transplant(_raw(old, chunk), chunk, int(first), layer))
                 table.append((chunk.points, size))
@@ -148,16 +158,15 @@ def _raw(file: BinaryIO, chunk: LayeredChunk) -> bytes:
     return file.read(chunk.end - chunk.position)
 
 
-def _class_layers(header: Header, records: npt.NDArray[Any], classes: Bytes) -> Iterator[bytes]:
+def _class_layers(header: Header, labels: Labels, classes: Bytes) -> Iterator[bytes]:
     """Compress classes; yield the layer of each chunk."""
     import lazrs
 
     assert header.laszip is not None
     assert header.laszip.chunk_size is not None
-    raw = records.view(np.uint8).reshape(len(records), header.record_length)
-    bare = np.zeros((len(records), _POINT14), np.uint8)
-    bare[:, _RETURNS] = raw[:, _RETURNS]
-    bare[:, _FLAGS] = raw[:, _FLAGS] & _CHANNEL
+    bare = np.zeros((labels.n, _POINT14), np.uint8)
+    bare[:, _RETURNS] = labels.returns
+    bare[:, _FLAGS] = labels.flags & CHANNEL
     bare[:, _CLASS] = classes
     for begin in range(0, len(bare), header.laszip.chunk_size):
         file = io.BytesIO()

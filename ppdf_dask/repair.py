@@ -29,6 +29,8 @@ def maker(path: str) -> tuple[str, str] | None:
     parts = path.removesuffix("/zarr.json").split("/")
     if parts[0] == "chunks" and len(parts) >= 4:
         return "tile", parts[3]
+    if parts[0] == "labels" and len(parts) >= 2:
+        return "tile", parts[1]
     if parts[0] in ("classification", "ground") and len(parts) >= 2 and parts[1] != "zarr.json":
         return "classify", parts[1]
     if parts[0] == "dtm":

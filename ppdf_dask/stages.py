@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Any
 
 from ppdf_dask import __version__, filters
-from ppdf_dask.dropped import kept_density
+from ppdf_dask.dropped import are_dropped, kept_density
 from ppdf_dask.dtm import DtmGrid, Raster
 from ppdf_dask.execute import Work
 from ppdf_dask.filters.cloud import Density
@@ -223,6 +223,7 @@ class Cutting:
         """Return the tiles whose chunks are all classified, largest first, and those that wait."""
         works: list[Work] = []
         waiting: list[Waiting] = []
+        dropped = are_dropped(self.store)
         for source, tile in self.inputs.sources.items():
             if source not in self.tiles:
                 continue
@@ -230,7 +231,14 @@ class Cutting:
             if missing:
                 waiting.append(Waiting("merge", source, f"chunk {missing[0]} is not classified"))
                 continue
-            job = MergeJob(self.inputs.tile_job(source), self.target(source), self.classify_key)
+            labels = 0 if dropped else self.index.labels[source]
+            job = MergeJob(
+                self.inputs.tile_job(source),
+                self.target(source),
+                self.classify_key,
+                labels,
+                self.inputs.tile_keys[source],
+            )
             works.append(Work(source, tile.point_count, job, self.merge_key(source)))
         return sorted(works, key=lambda w: (-w.points, w.ident)), waiting
 

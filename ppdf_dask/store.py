@@ -4,6 +4,7 @@ Layout of ``run.zarr`` (each leaf has exactly one writer)::
 
     chunks/<chunk>/core/<source>     int32 (3, n): x, y, z in mm; x, y from the chunk's lower-left corner
     chunks/<chunk>/buffer/<source>   the same for the surroundings of the chunk
+    labels/<source>/<number>         uint8 (5, n): what the merge needs of each point of a file (`ppdf_dask.kept`)
     classification/<chunk>           uint8 (n): 1 ground, 0 not, 255 never written; order of the core fragments
     ground/<chunk>                   int32 (3, n): the ground points, for the terrain model
     dtm/{height,distance,y,x}        float32 blocks of the global raster, one shard each
@@ -31,18 +32,19 @@ from zarr.storage import MemoryStore
 from ppdf_dask.errors import DamagedError, StoreError
 from ppdf_dask.objects import ObjectStore, node_bytes
 
-FORMAT = 3
+FORMAT = 4
 """Version of the layout above; a store of another version is refused."""
 
 # Bit shuffling in LZ4 packs the integers of a fragment into 5 % more bytes than zstd does (level 3), at a quarter of
 # the processor time; a delta in front of it gains nothing.
 _POINTS = (BloscCodec(typesize=4, cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec())
+_LABELS = (BloscCodec(typesize=1, cname="zstd", clevel=1, shuffle="bitshuffle"), Crc32cCodec())
 _BYTES = (BloscCodec(typesize=1, cname="zstd", clevel=3, shuffle="bitshuffle"), Crc32cCodec())
 
 # One object for a fragment up to this many points; a longer one gets more, in proportion to the data.
 _CHUNK_POINTS = 8_000_000
 
-GROUPS = ("ledger", "chunks", "classification", "ground")
+GROUPS = ("ledger", "chunks", "labels", "classification", "ground")
 
 
 class RunStore(ObjectStore):
@@ -156,6 +158,16 @@ class RunStore(ObjectStore):
     def chunks(self) -> list[str]:
         """Return the sorted ids of all chunks with fragments."""
         return self.children("chunks")
+
+    def write_labels(self, source: str, number: int, rows: npt.NDArray[np.uint8], chunks: list[str]) -> None:
+        """Write a batch of labels of a file; `chunks` names those that own its points."""
+        self._write(f"labels/{source}/{number:06d}", rows, _LABELS, 255, {"chunks": chunks})
+
+    def read_labels(self, source: str, number: int, made_by: str) -> tuple[npt.NDArray[np.uint8], list[str]]:
+        """Read a batch of labels and the chunks that own its points; raises DamagedError as `read_points`."""
+        path = f"labels/{source}/{number:06d}"
+        rows: npt.NDArray[np.uint8] = self._read(path, made_by)
+        return rows, list((self.get_node(path) or {})["chunks"])
 
     # -- results --------------------------------------------------------------------------------------------------
 

@@ -22,8 +22,10 @@ import numpy.typing as npt
 from ppdf_dask.errors import TileError
 from ppdf_dask.filters.cloud import LIMIT
 from ppdf_dask.grid import DENSITY_CELL, MM, ChunkGrid, Rect
+from ppdf_dask.kept import Groups, keep_labels
 from ppdf_dask.params import RunParams
-from ppdf_dask.reader import Batch, batches
+from ppdf_dask.reader import BATCH, Batch, at_once, batches, header_of
+from ppdf_dask.relabel import can_relabel, whole_chunks
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import Tile
 
@@ -32,6 +34,9 @@ Int32 = npt.NDArray[np.int32]
 
 SPILL_POINTS = 6_000_000
 """Buffered points (12 bytes each) above which fragments in the making go to a temporary folder."""
+
+WORTH_KEEPING = 50_000
+"""Points of a file from which on it takes less time, and objects, to keep labels than to decode it again."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +67,15 @@ class TileJob:
     grid: ChunkGrid
     buffer: int
 
-    def batches(self) -> Iterator[Batch]:
-        """Decode the file in order, batch by batch."""
+    def batches(self, size: int = BATCH) -> Iterator[Batch]:
+        """Decode the file in order, `size` points at a time."""
         return batches(
             self.tile,
             unit_xy=self.unit_xy,
             unit_z=self.unit_z,
             rules=self.params.classes,
             returns=self.params.returns,
+            size=size,
         )
 
 
@@ -149,20 +155,23 @@ def cut(store: RunStore, job: TileJob) -> dict[str, Any]:
     -------
     dict
         ``points``, ``eligible``, measured ``bounds`` (mm), ``z`` range (mm), ``classes`` histogram of the file and
-        ``chunks``: chunk id to ``[core points, occupied density cells, buffer points]``.
+        ``chunks``: chunk id to ``[core points, occupied density cells, buffer points]``; ``labels``: how many batches
+        of labels were kept for the merge (`ppdf_dask.kept`).
 
     Raises
     ------
     TileError
         Damaged or changed file; nothing of it counts until its record is published.
     """
-    facts = _Facts()
+    facts, header = _Facts(), header_of(job.tile)
+    keep = can_relabel(header, at_once(header)) and job.tile.point_count >= WORTH_KEEPING
     with tempfile.TemporaryDirectory(prefix="ppdf-tile-") as folder:
         spool = _Spool(Path(folder))
         cells: dict[str, npt.NDArray[np.bool_]] = {}
-        for batch in job.batches():
+        for number, batch in enumerate(job.batches(whole_chunks(header, at_once(header)) if keep else BATCH)):
             facts.add(batch)
-            _spread(job, batch, spool, cells)
+            owners = _spread(job, batch, spool, cells)
+            keep = keep and keep_labels(store, job.source, number, batch.labels, owners)
         counts: dict[str, list[int]] = {}
         for (chunk, part), points in spool.fragments():
             entry = counts.setdefault(chunk, [0, 0, 0])
@@ -172,13 +181,15 @@ def cut(store: RunStore, job: TileJob) -> dict[str, Any]:
                 entry[1] = int(cells[chunk].sum())
                 attributes = {"density_cells": pack_cells(cells[chunk])}
             store.write_points(chunk, part, job.source, points, attributes)
-    return facts.record() | {"chunks": dict(sorted(counts.items()))}
+    return facts.record() | {"chunks": dict(sorted(counts.items())), "labels": number + 1 if keep else 0}
 
 
-def _spread(job: TileJob, batch: Batch, spool: _Spool, cells: dict[str, npt.NDArray[np.bool_]]) -> None:
+def _spread(job: TileJob, batch: Batch, spool: _Spool, cells: dict[str, npt.NDArray[np.bool_]]) -> Groups:
+    """Give the points to the chunks; return which of the batch's eligible points each one owns."""
     x, y, z = (values[batch.eligible] for values in (batch.x, batch.y, batch.z))
+    found: Groups = []
     if len(x) == 0:
-        return
+        return found
     if max(-int(z.min()), int(z.max())) > LIMIT:
         raise TileError(
             f"{job.tile.path}: a height of {max(-int(z.min()), int(z.max())) / MM:.0f} m cannot be stored; "
@@ -191,12 +202,14 @@ def _spread(job: TileJob, batch: Batch, spool: _Spool, cells: dict[str, npt.NDAr
     for ix, iy, index in owners(job.grid, x, y):
         chunk = job.grid.chunk(ix, iy)
         points = _relative(rows, index, chunk.core)
+        found.append((chunk.id, index))
         spool.add(chunk.id, "core", points)
         seen = cells.setdefault(chunk.id, np.zeros(side * side, np.bool_))
         seen[points[0] // DENSITY_CELL * side + points[1] // DENSITY_CELL] = True
     for ix, iy, index in neighbours(job.grid, job.buffer, x, y):
         chunk = job.grid.chunk(ix, iy)
         spool.add(chunk.id, "buffer", _relative(rows, index, chunk.core))
+    return found
 
 
 def _relative(rows: list[Int64], index: Int64, core: Rect) -> Int32:

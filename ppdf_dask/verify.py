@@ -136,6 +136,7 @@ class _Check:
         tiles = self._done("tile", self.inputs.tile_keys)
         self.cutting = Cutting(self.inputs, self.store, tiles)
         self._fragments()
+        self._labels()
         try:
             key = self.cutting.classify_key
         except DamagedError:
@@ -168,6 +169,14 @@ class _Check:
                         self.report.counts["eligible"] += n if part == "core" else 0
                     except DamagedError as error:
                         self._damage(error)
+
+    def _labels(self) -> None:
+        for source, count in self.cutting.index.labels.items():
+            for number in range(0 if self.dropped else count):
+                try:
+                    self.store.read_labels(source, number, self.inputs.tile_keys[source])
+                except DamagedError as error:
+                    self._damage(error)
 
     def _classification(self, chunks: Records) -> None:
         for chunk, record in chunks.items():
@@ -242,7 +251,7 @@ class _Check:
     def _strays(self) -> None:
         for path in self.cutting.index.orphans(self.store):
             self._orphan(path, "belongs to no tile or chunk of this run")
-        known = {"ledger", "chunks", "classification", "ground", "dtm", "lock"}
+        known = {"ledger", "chunks", "labels", "classification", "ground", "dtm", "lock"}
         for name in self.store.children(""):
             if name not in known:
                 self._add("foreign", name, "is none of this run's; remove it by hand", None)

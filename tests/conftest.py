@@ -53,9 +53,23 @@ def undisturbed(tiles: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the survey of `tiles` as the fault tests do, with nothing in its way; ``puts.txt`` counts its writes."""
     from faulty import Inline, at_put, finished, killed, small_plan
 
+    from ppdf_dask import tiler
+
     out, client = tmp_path_factory.mktemp("undisturbed"), Inline()
-    with at_put(-1, killed) as keys:
+    with at_put(-1, killed) as keys, pytest.MonkeyPatch.context() as patched:
+        patched.setattr(tiler, "WORTH_KEEPING", 0)
         small_plan(tiles, out).run(client)
     assert finished(out) == set(client.ran)
     (out / "puts.txt").write_text(str(len(keys)))
     return out
+
+
+@pytest.fixture(autouse=True)
+def labels_of_small_tiles(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Let the fault tests find labels in their stores, though their tiles are too small to be worth it."""
+    from ppdf_dask import tiler
+
+    with pytest.MonkeyPatch.context() as patched:
+        if "tiles" in request.fixturenames:
+            patched.setattr(tiler, "WORTH_KEEPING", 0)
+        yield

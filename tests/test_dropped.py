@@ -31,6 +31,13 @@ def test_dropped_points_are_gone_results_stay_and_come_again_when_needed(small_s
     assert not [e for e in events if e.state == "done"]
     assert {p: p.read_bytes() for p in before} == before
 
+    # A lost tile is written again from the source, for its labels are gone too.
+    result.tiles[0].unlink()
+    events.clear()
+    plan(survey, params, out=result.out).run(client, on_event=events.append)
+    assert [e.stage for e in events if e.state == "done"] == ["merge"]
+    assert {p: p.read_bytes() for p in before} == before
+
     # A lost mask needs its points: all tiles are cut again, one chunk is classified again.
     store = RunStore(str(result.out / "run.zarr"))
     chunk = store.classified()[0]

@@ -65,6 +65,8 @@ DAMAGE = [
     (cut_off, f"{CORE}/zarr.json", "torn", "tile s_000000"),
     (remove, f"{CORE}/zarr.json", "missing", "tile s_000000"),
     (remove, f"chunks/{CHUNK}", "missing", "tile s_000000"),
+    (flip, "labels/s_000000/000000/c/0/0", "flipped", "tile s_000000"),
+    (remove, "labels/s_000000", "missing", "tile s_000000"),
     (flip, f"classification/{CHUNK}/c/0", "flipped", f"classify {CHUNK}"),
     (swap, f"classification/{CHUNK}", "foreign", f"classify {CHUNK}"),
     (remove, f"classification/{CHUNK}", "missing", f"classify {CHUNK}"),
@@ -120,12 +122,13 @@ def test_f36_what_nobody_claims_is_listed_and_goes_away(tiles, undisturbed, run)
     store = run / "run.zarr"
     shutil.copytree(store / CORE, store / "chunks/c_0099_0099/core/s_000000")
     shutil.copytree(store / CORE, store / f"chunks/{CHUNK}/core/s_000077")
+    shutil.copytree(store / "labels/s_000000/000000", store / "labels/s_000000/000007")
     (store / CORE / "c/0/0.abc.partial").write_bytes(b"half")
     (run / "laz" / ".a.laz.123.part").write_bytes(b"half")
     (run / "laz" / "stranger.laz").write_bytes(b"not ours")
     report = verify(run)
     assert {f.kind for f in report.findings} == {"orphaned", "foreign"}
-    assert len(report.findings) == 5
+    assert len(report.findings) == 6
     assert report.redo == []
     # Foreign fragments are never read, whether or not anyone looked for them.
     assert replay(run, CHUNK) == replay(undisturbed, CHUNK) | {"peak_mb": replay(run, CHUNK)["peak_mb"]}
@@ -138,7 +141,8 @@ def test_f36_what_nobody_claims_is_listed_and_goes_away(tiles, undisturbed, run)
 
 
 @pytest.mark.parametrize(
-    "path", [f"{CORE}/c/0/0", f"chunks/{CHUNK}", record_path("index", CHUNK), f"classification/{CHUNK}"]
+    "path",
+    [f"{CORE}/c/0/0", f"chunks/{CHUNK}", "labels/s_000001", record_path("index", CHUNK), f"classification/{CHUNK}"],
 )
 def test_a_run_finds_damage_itself_goes_back_and_mends_it(tiles, undisturbed, run, path):
     """Nobody asked `verify`: the stage that needs the object stumbles, its maker works again, then the stage."""

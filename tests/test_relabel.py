@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 from lasfiles import LEGACY_COUNT, patch, points, write
 
-from ppdf_dask import merge
-from ppdf_dask.errors import TileError
+from ppdf_dask import kept, merge
+from ppdf_dask.errors import DamagedError, TileError
 from ppdf_dask.grid import ChunkGrid
 from ppdf_dask.lasheader import read_header
 from ppdf_dask.layers import chunks
+from ppdf_dask.merge import MergeJob
 from ppdf_dask.params import RunParams
 from ppdf_dask.relabel import can_relabel
+from ppdf_dask.store import RunStore
 from ppdf_dask.survey import scan
-from ppdf_dask.tiler import TileJob
+from ppdf_dask.tiler import TileJob, cut
 
 N = 120_000
 """Points of three chunks."""
@@ -73,7 +75,7 @@ def test_one_new_layer_gives_the_bytes_of_a_full_rewrite(tmp_path, monkeypatch, 
 def test_batches_end_with_chunks(tmp_path, monkeypatch):
     job = job_of(source(tmp_path / "a.laz"))
     merge.rewrite(job, tmp_path / "one.laz", every_third)
-    monkeypatch.setattr(merge, "BATCH", 60_000)
+    monkeypatch.setattr(merge, "at_once", lambda header: 60_000)
     merge.rewrite(job, tmp_path / "three.laz", every_third)
     assert (tmp_path / "one.laz").read_bytes() == (tmp_path / "three.laz").read_bytes()
 
@@ -130,3 +132,38 @@ def test_other_formats_and_large_chunks_are_written_in_full(tmp_path):
     assert not can_relabel(layered, 49_999)
     assert not can_relabel(read_header(str(write(tmp_path / "old.laz", point_format=1))), merge.BATCH)
     assert not can_relabel(read_header(str(write(tmp_path / "plain.las"))), merge.BATCH)
+
+
+def cut_small(tmp_path, most_owners):
+    """Cut a tile with chunks of 20 m and answer every chunk; return the store, the job and the tile's record."""
+    source(tmp_path / "a.laz")
+    survey = scan([tmp_path / "a.laz"], assume_units="m")
+    job = TileJob("s_000000", survey.tiles[0], 1.0, 1.0, RunParams(), ChunkGrid(20_000), 0)
+    store = RunStore(str(tmp_path / "run.zarr"), "key")
+    store.create({})
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(kept, "MOST_OWNERS", most_owners)
+        record = cut(store, job)
+    for number, (chunk, (core, _, _)) in enumerate(sorted(record["chunks"].items())):
+        mask = np.random.default_rng(number).random(core) < 0.5
+        store.write_classification(chunk, mask, {"s_000000": core})
+    return store, job, record
+
+
+def test_with_labels_the_source_is_not_decoded_again(tmp_path, monkeypatch):
+    store, job, record = cut_small(tmp_path, 1000)
+    assert record["labels"] == 1
+    assert len(record["chunks"]) > 20
+    again = merge.write_tile(store, MergeJob(job, str(tmp_path / "again.laz")))
+    monkeypatch.setattr(merge, "tile_records", None)
+    once = merge.write_tile(store, MergeJob(job, str(tmp_path / "once.laz"), labels=1, cut_by="key"))
+    assert once == again
+    assert (tmp_path / "once.laz").read_bytes() == (tmp_path / "again.laz").read_bytes()
+    with pytest.raises(DamagedError, match="of another run"):
+        merge.write_tile(store, MergeJob(job, str(tmp_path / "other.laz"), labels=1, cut_by="other"))
+
+
+def test_labels_of_too_many_owners_are_not_kept(tmp_path):
+    store, _, record = cut_small(tmp_path, 20)
+    assert record["labels"] == 0
+    assert store.children("labels") == []

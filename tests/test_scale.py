@@ -14,6 +14,7 @@ from ppdf_dask.experiments.simulate import PER_TILE, country, simulate
 from ppdf_dask.filters.cloud import Density
 from ppdf_dask.params import ChunkParams, RunParams
 from ppdf_dask.plan import plan
+from ppdf_dask.store import RunStore
 from ppdf_dask.survey import scan
 
 
@@ -27,6 +28,8 @@ def test_a_job_is_measured_beside_its_copy(small_survey, tmp_path):
     assert list(row.stages) == ["tile", "classify", "merge", "dtm", "cog"]
     assert 0 < row.idle < 1
     assert row.seconds > max(c.seconds for c in row.copies)
+    store = RunStore(str(tmp_path / "run" / "run.zarr"))
+    assert row.fragments == sum(len(store.sources(c, part)) for c in store.chunks() for part in ("core", "buffer"))
     assert row.objects <= 20 * row.chunks + 2 * row.fragments
     assert row.usage["workers"].cpu_seconds > 0
     assert all(u.peak_mb > 20 for u in row.usage.values())

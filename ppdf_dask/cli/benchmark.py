@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ppdf_dask.cli.scale import scale
+from ppdf_dask.cli.scale import proof, scale
 from ppdf_dask.cli.show import (
     chosen,
     chosen_filter,
@@ -96,6 +96,7 @@ def speed(
 
 
 benchmark.add_command(scale)
+benchmark.add_command(proof)
 
 
 @benchmark.command("density")

@@ -1,4 +1,4 @@
-"""Commands about seams and size: seams, and what `benchmark scale` runs."""
+"""Commands about seams and size: seams, and what `benchmark scale` and `benchmark proof` run."""
 
 from __future__ import annotations
 
@@ -52,6 +52,35 @@ def scale(points: list[float], workers: list[float], simulate: int | None, keep:
             sizes = [p * 1e6 for p in points]
             found = study(sizes, [int(w) for w in workers], Path(folder), RunParams(), tick)
         show(found, as_json=as_json)
+
+
+@click.command()
+@click.argument("tiles", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path), metavar="TILES...")
+@click.option(
+    "--chunk-size",
+    "sizes",
+    multiple=True,
+    type=click.FloatRange(min=5),
+    default=(150.0,),
+    show_default=True,
+    help="Edge of the chunks, m, beside the planner's choice; may be repeated.",
+)
+@click.option("--profile", type=click.Choice(["robust", "paper"]), default="robust", show_default=True)
+@click.option("--repeat", type=click.IntRange(1), default=5, show_default=True, help="Rounds with and without the bit.")
+@json_option
+def proof(tiles: tuple[Path, ...], sizes: tuple[float, ...], profile: str, repeat: int, as_json: bool) -> None:
+    """Measure what exact seams cost: the proof bit in the filter, buffers, and clouds classified again.
+
+    \b
+    ppdf-dask benchmark proof tile.laz
+    ppdf-dask benchmark proof DIR/40M/tiles --chunk-size 150
+    """
+    from ppdf_dask.experiments import proof as study
+    from ppdf_dask.survey import scan
+
+    found = [Path(tile.path) for tile in scan([str(t) for t in tiles]).tiles]
+    with ticking(2 + len(sizes), "proof") as tick:
+        show(study.measure(found, [None, *sizes], profile, repeat, tick), as_json=as_json)
 
 
 @click.command()

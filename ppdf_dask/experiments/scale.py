@@ -11,6 +11,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -24,6 +25,9 @@ from ppdf_dask.synthetic import SyntheticParams
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from ppdf_dask.reader import Labels
+    from ppdf_dask.tiler import TileJob
 
 LANDSCAPE = SyntheticParams()
 """A wooded valley of 8.8 points/m2."""
@@ -209,7 +213,7 @@ def measure(client: Client, pids: dict[str, list[int]], tiles: list[Path], folde
     }
     busy = sum(total["seconds"] for total in stages.values())
     files = [f for f in (folder / "run" / "run.zarr").rglob("*") if f.is_file()]
-    fragments = sum(f.name == "zarr.json" and len(f.relative_to(folder / "run").parts) == 6 for f in files)
+    fragments = sum(1 for _ in (folder / "run" / "run.zarr" / "chunks").glob("*/*/*/zarr.json"))
     return Measured(
         points=survey.point_count,
         workers=workers,
@@ -218,7 +222,7 @@ def measure(client: Client, pids: dict[str, list[int]], tiles: list[Path], folde
         stages=stages,
         idle=round(1 - busy / (workers * seconds), 3),
         usage=watch.usage,
-        work=shares(folder / "run", tiles[0], copies, survey.point_count, watch.usage["workers"].cpu_seconds),
+        work=shares(folder / "run", tiles[0], survey.point_count, watch.usage["workers"].cpu_seconds),
         store_mb=round(sum(f.stat().st_size for f in files) / 1e6, 1),
         input_mb=round(sum(t.size for t in survey.tiles) / 1e6, 1),
         objects=len(files),
@@ -228,14 +232,15 @@ def measure(client: Client, pids: dict[str, list[int]], tiles: list[Path], folde
     )
 
 
-def shares(run: Path, tile: Path, copies: list[Copy], points: int, total: float) -> dict[str, float]:
+def shares(run: Path, tile: Path, points: int, total: float) -> dict[str, float]:
     """Estimate which share of the workers' processor time goes where, from one tile and the ledger.
 
     Returns
     -------
     dict
-        ``decode`` (twice), ``encode``, ``verify``: of the tiles; ``buffers``, ``retries``: of the classification, the
-        first over points around the cores, the second with wider buffers; each as a share of `total`.
+        ``decode`` (once), ``encode`` (the layer of classes), ``verify`` (reading the written file again): of the tiles;
+        ``buffers``, ``retries``: of the classification, the first over points around the cores, the second with wider
+        buffers; each as a share of `total`.
     """
     from ppdf_dask.saved import load_plan
     from ppdf_dask.stages import Inputs
@@ -243,17 +248,15 @@ def shares(run: Path, tile: Path, copies: list[Copy], points: int, total: float)
 
     inputs = Inputs(load_plan(run))
     job = next(j for j in map(inputs.tile_job, inputs.sources) if j.tile.path == str(tile))
-    narrow = _cpu(lambda: sum(b.n for b in job.batches()))
-    whole, verify = _cpu(lambda: _read(tile, False)), _cpu(lambda: _read(tile, True))
+    decode, encode, verify = _tile_work(job)
     scale = points / job.tile.point_count / total
-    copied = sum(c.cpu_seconds for c in copies) / len(copies) / total
     records = [record for _, record in RunStore(str(run / "run.zarr")).records("classify")]
     spent = sum(r["cpu_seconds"] for r in records) / total
     core, first = sum(r["points"] for r in records), sum(r["loaded_first"] for r in records)
     loaded = sum(r["loaded"] for r in records)
     return {
-        "decode": round((narrow + whole) * scale, 3),
-        "encode": round(copied - whole * scale, 3),
+        "decode": round(decode * scale, 3),
+        "encode": round(encode * scale, 3),
         "verify": round(verify * scale, 3),
         "buffers": round(spent * (first - core) / loaded, 3),
         "retries": round(spent * (loaded - first) / loaded, 3),
@@ -266,15 +269,22 @@ def _cpu(function: Callable[[], object]) -> float:
     return time.process_time() - begin
 
 
-def _read(tile: Path, classes_only: bool) -> None:
-    import laspy
+def _tile_work(job: TileJob) -> tuple[float, float, float]:
+    """Return the processor seconds of decoding a tile, of writing it with new classes and of reading that again."""
+    from ppdf_dask.lasheader import read_header
+    from ppdf_dask.merge import class_counts
+    from ppdf_dask.reader import at_once
+    from ppdf_dask.relabel import differs, relabel, whole_chunks
 
-    chosen = laspy.DecompressionSelection.all()
-    if classes_only:
-        chosen = laspy.DecompressionSelection.base() | laspy.DecompressionSelection.CLASSIFICATION
-    with laspy.open(tile, laz_backend=laspy.LazBackend.Lazrs, decompression_selection=chosen) as reader:
-        for _ in reader.chunk_iterator(1_000_000):
-            pass
+    path = job.tile.path
+    header = read_header(path)
+    labels: list[Labels] = []
+    decode = _cpu(lambda: labels.extend(b.labels for b in job.batches(whole_chunks(header, at_once(header)))))
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "again.laz"
+        encode = _cpu(lambda: relabel(path, header, target, ((part, part.classification) for part in labels)))
+        verify = _cpu(lambda: (differs(path, header, target), class_counts(target)))
+    return decode, encode, verify
 
 
 @dataclass(frozen=True)
