@@ -208,20 +208,22 @@ def link(low, c, patch, planes):
 
 
 def raised(low, c, name, cells, patch, root, planes, params):
-    borders = drops = 0
+    borders = drops = 0.0
     for (i, j), (dx, dy) in product(cells, ((1, 0), (-1, 0), (0, 1), (0, -1))):
         plane = planes[patch[i, j]]
         tilt = sqrt(plane[0] ** 2 + plane[1] ** 2)
-        falls = False
+        falls = steps = False
         for far in range(1, 13):
             n = i + far * dx, j + far * dy
             if n in patch and root(patch[n]) == name:
                 break
-            if n in low and far * c <= round(params.border_reach * 1000):
-                falls |= height(plane, low[n], c) < -(params.border_drop + 0.5 * tilt * far * (c * 1e-3))
+            if n in low and far * c <= round(params.border_reach * 1000) and not falls:
+                above = height(plane, low[n], c)
+                falls = above < -(params.border_drop + 0.5 * tilt * far * (c * 1e-3))
+                steps |= not falls and above < -0.5
         else:
             borders += 1
-            drops += falls
+            drops += falls * (params.border_gentle if steps else 1.0)
     return drops > params.border_share * borders
 
 

@@ -31,7 +31,8 @@ def scene(seed, n=2500, side=110.0, snap=1):
     for _ in range(rng.integers(0, 6)):
         a, b = rng.uniform(0, side, 2)
         w, h = rng.uniform(3, 30, 2)
-        z += np.where((np.abs(x - a) < w / 2) & (np.abs(y - b) < h / 2), rng.uniform(2, 9), 0.0)
+        inside = np.minimum(w / 2 - np.abs(x - a), h / 2 - np.abs(y - b))
+        z += rng.uniform(2, 9) * np.clip(inside / rng.choice([0.001, 3.0, 6.0]), 0, 1)  # a wall, or a flank
     z += np.where(rng.random(len(x)) < 0.2, rng.exponential(2.0, len(x)), 0.0)
     z -= np.where(rng.random(len(x)) < 0.01, rng.uniform(2, 9, len(x)), 0.0)
     mm = np.rint(np.column_stack([x, y, z]) * 1000 / snap).astype(np.int64) * snap
@@ -82,6 +83,18 @@ def test_what_is_proven_in_a_crop_is_true_of_the_whole(seed, fraction, snap, par
     cut = classify(cloud, params)
     proven = ~cut.unproven
     assert np.array_equal(cut.ground[proven], whole.ground[inside][proven])
+
+
+@pytest.mark.parametrize(("flank", "ground"), [(0.001, 0.0), (8.0, 1.0)])
+def test_what_falls_at_once_is_a_building_what_falls_step_by_step_a_dam(flank, ground):
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(0, 160, (2, 50_000))
+    across, along = np.abs(x - 80) - 8, np.abs(y - 80) - 70
+    z = 5.0 * np.clip(1 - np.maximum(across, along) / flank, 0, 1) + rng.normal(0, 0.03, len(x))
+    crest = (across < -1) & (along < -1)
+    found = classify_ground(np.column_stack([x, y, z]))
+    assert found[crest].mean() == pytest.approx(ground, abs=0.02)
+    assert found[(across > flank + 1) | (along > flank + 1)].mean() > 0.99
 
 
 def test_a_wide_crop_proves_its_middle():
@@ -175,7 +188,14 @@ def test_fixed_points_are_ground_and_references():
 
 @pytest.mark.parametrize(
     ("points", "cells", "size", "parts"),
-    [(225, 4, 2.0, 1), (224, 4, 2.0, 2), (225, 16, 2.0, 2), (900, 64, 2.0, 2), (899, 64, 2.25, 2), (1, 1, 4.0, 2)],
+    [
+        (2_985_984, 40_000, 2.0, 1),  # 1.2^6 points/m2: 2.4 m over its sixth root is 2 m exactly
+        (2_985_983, 40_000, 2.25, 1),
+        (225, 4, 2.25, 1),
+        (224, 4, 2.25, 2),
+        (25, 1, 2.5, 2),
+        (1, 1, 4.0, 2),
+    ],
 )
 def test_the_cells_follow_the_density(points, cells, size, parts):
     resolved = RobustParams().resolve(Density(points, cells))

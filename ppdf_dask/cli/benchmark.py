@@ -34,9 +34,16 @@ def benchmark() -> None:
 @benchmark.command()
 @click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="DATA_DIR")
 @score_option
+@click.option(
+    "--turn",
+    type=float,
+    default=0.0,
+    metavar="DEGREES",
+    help="Turn the clouds about their middle first, which moves every cell: how much of a figure is luck.",
+)
 @chosen_filter
 @json_option
-def accuracy(data: Path, score: str | None, as_json: bool, **options: Any) -> None:
+def accuracy(data: Path, score: str | None, turn: float, as_json: bool, **options: Any) -> None:
     """Score one filter, with one set of parameters, on every labelled cloud of a folder.
 
     Class 2 is the reference ground. DATA_DIR's subfolder als is taken if there is one. Where the reference's ground is
@@ -46,12 +53,13 @@ def accuracy(data: Path, score: str | None, as_json: bool, **options: Any) -> No
     ppdf-dask benchmark accuracy DATA --score "user_data==0"
     ppdf-dask benchmark accuracy DATA --score "user_data==0" --profile paper --json
     ppdf-dask benchmark accuracy DATA --filter smrf --set threshold=0.3
+    ppdf-dask benchmark accuracy DATA --score "user_data==0" --turn 31
     """
     from ppdf_dask.experiments.accuracy import AccuracyTable, measure
     from ppdf_dask.experiments.labelled import files_in, read
 
     params = chosen(**options)
-    rows = [measure(read(path, score), params) for path in tracked(files_in(data), "clouds")]
+    rows = [measure(read(path, score).turned(turn), params) for path in tracked(files_in(data), "clouds")]
     show(AccuracyTable(params, tuple(rows)), as_json=as_json)
 
 

@@ -124,6 +124,7 @@ def _seed(cells: Cells, params: RobustParams) -> None:
         round(params.border_reach * MM),
         params.border_drop,
         params.border_share,
+        params.border_gentle,
         params.smallest_patch,
         round(params.largest_building * MM),
     )

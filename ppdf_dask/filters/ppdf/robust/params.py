@@ -26,7 +26,7 @@ class RobustParams(Parameters):
     ----------
     cell_size : float or None
         Edge of the cells whose lowest point may become a reference, m, rounded to 2 mm; None: from the density, 2 m
-        at 0.57 points/m2 and above, up to 4 m.
+        at 3 points/m2 and above, 2.5 m at 1, 3 m at 0.3.
     refinement : int or None
         2: a second growth over cells of half the size; 1: none; None: 2 below 2.25 points/m2, where a cell holds too
         few points to follow break lines.
@@ -39,7 +39,7 @@ class RobustParams(Parameters):
     largest_building : float
         A raised patch of this extent or more is terrain, m; the side of the largest hall in the survey.
     search_radius : float
-        References are sought up to this distance, m.
+        References are sought up to this distance, m; half of it over the finer cells.
     trials : int
         RANSAC trials per square.
     inlier_distance : float
@@ -53,6 +53,8 @@ class RobustParams(Parameters):
     border_drop, border_reach, border_share : float
         A patch is a roof or a crown when along this share of its border a low point within `border_reach` m lies more
         than `border_drop` m (and half the plane's rise over the distance) below its plane.
+    border_gentle : float
+        What a border counts that falls step by step, like an embankment's, instead of at once like a wall.
     passes : int
         Passes of growth.
     growth_base, growth_spread, growth_slope : float
@@ -74,7 +76,7 @@ class RobustParams(Parameters):
     --------
     >>> from ppdf_dask.filters.cloud import Density
     >>> RobustParams().resolve(Density(points=1000, cells=200)).cell_size
-    3.5
+    3.25
     """
 
     RETURNS: ClassVar = "last"
@@ -84,7 +86,7 @@ class RobustParams(Parameters):
     tolerance: float = quantity(0.2, "m", low=0.01, high=5.0)
     roughness: float = quantity(0.65, "1", low=0.0, high=10.0)
     largest_building: float = quantity(250.0, "m", low=0.0, high=2000.0)
-    search_radius: float = quantity(20.0, "m", low=1.0, high=200.0)
+    search_radius: float = quantity(25.0, "m", low=1.0, high=200.0)
     trials: int = quantity(30, "trials", low=1, high=10_000)
     inlier_distance: float = quantity(0.3, "m", low=0.01, high=5.0)
     inlier_share: float = quantity(0.5, "1", low=0.0, high=1.0)
@@ -93,16 +95,17 @@ class RobustParams(Parameters):
     border_drop: float = quantity(1.5, "m", low=0.0, high=100.0)
     border_reach: float = quantity(10.0, "m", low=0.0, high=100.0)
     border_share: float = quantity(0.45, "1", low=0.0, high=1.0)
+    border_gentle: float = quantity(0.5, "1", low=0.0, high=1.0)
     passes: int = quantity(8, "passes", low=0, high=100)
     growth_base: float = quantity(0.3, "m", low=0.0, high=10.0)
-    growth_spread: float = quantity(0.15, "1", low=0.0, high=10.0)
+    growth_spread: float = quantity(0.1, "1", low=0.0, high=10.0)
     growth_slope: float = quantity(0.4, "1", low=0.0, high=10.0)
     growth_step: float = quantity(0.3, "m", low=0.0, high=10.0)
     fine_passes: int = quantity(3, "passes", low=0, high=100)
     fine_base: float = quantity(0.1, "m", low=0.0, high=10.0)
-    fine_spread: float = quantity(0.1, "1", low=0.0, high=10.0)
+    fine_spread: float = quantity(0.12, "1", low=0.0, high=10.0)
     fine_slope: float = quantity(0.35, "1", low=0.0, high=10.0)
-    fine_step: float = quantity(0.2, "m", low=0.0, high=10.0)
+    fine_step: float = quantity(0.15, "m", low=0.0, high=10.0)
     fine_roughness: float = quantity(1.3, "1", low=0.0, high=10.0)
     label_spread: float = quantity(0.1, "1", low=0.0, high=10.0)
     label_slope: float = quantity(0.45, "1", low=0.0, high=10.0)
@@ -128,13 +131,13 @@ class RobustParams(Parameters):
     def resolve(self, density: Density) -> RobustParams:
         """Fill in what follows from the job-wide density.
 
-        The cell is ``clip(ceil(4 * 1.5 / sqrt(density)) / 4, 2, 4)`` metres, computed in integers so that no rounding
-        can move it: the smallest k (8 to 16) with k^2 >= 36 / density.
+        The cell is ``clip(ceil(4 * 2.4 / density ** (1 / 6)) / 4, 2, 4)`` metres, computed in integers so that no
+        rounding can move it: the smallest k (8 to 16) with k^6 >= 9.6^6 / density.
         """
         size, refinement = self.cell_size, self.refinement
         if size is None:
             quarters = 8
-            while quarters < 16 and quarters * quarters * density.points < 36 * 25 * density.cells:
+            while quarters < 16 and (5 * quarters) ** 6 * density.points < 48**6 * 25 * density.cells:
                 quarters += 1
             size = quarters / 4
         if refinement is None:

@@ -10,6 +10,9 @@ from numba import njit
 from ppdf_dask.filters.ppdf.compiled import leaf
 from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, ROOF, UNPROVEN
 
+STEP = 0.5
+"""Metres below a patch's plane at which a low point lies partway down."""
+
 
 @leaf
 def residual(planes: Any, squares: Any, p: Any, pos: Any, k: Any, cell: Any) -> Any:
@@ -99,13 +102,19 @@ def judge_components(
     reach: Any,
     drop: Any,
     share: Any,
+    gentle: Any,
     smallest: Any,
     largest: Any,
 ) -> None:
-    """Drop the seeds of components that are too small or whose border drops away on most sides."""
+    """Drop the seeds of components that are too small or whose border drops away on most sides.
+
+    A wall falls at once; the flank of an embankment falls step by step. A direction in which a low point lies partway
+    down, more than `STEP` below the plane, before the drop counts as `gentle` of one.
+    """
     seeds = np.zeros(count, np.int64)
     borders = np.zeros(count, np.int64)
     drops = np.zeros(count, np.int64)
+    slow = np.zeros(count, np.int64)
     box = np.empty((count, 4), np.int64)
     box[:, 0:2] = 1 << 40
     box[:, 2:4] = -1
@@ -127,6 +136,7 @@ def judge_components(
         for direction in range(4):
             inside = False
             falls = False
+            steps = False
             j = k
             for far in range(1, look_out + 1):
                 j += shift[direction]
@@ -137,10 +147,13 @@ def judge_components(
                     open_[root] = True
                 if state[j] & LOW and far * cell <= reach and not falls:
                     fall = drop + 0.5 * tilt * far * (cell * 1e-3)
-                    falls = residual(planes, squares, p, pos, j, cell) < -fall
+                    height = residual(planes, squares, p, pos, j, cell)
+                    falls = height < -fall
+                    steps |= not falls and height < -STEP
             if not inside:
                 borders[root] += 1
-                drops[root] += falls
+                drops[root] += falls and not steps
+                slow[root] += falls and steps
     verdict = np.zeros(count, np.uint8)
     for p in range(count):
         if parent[p] != p:
@@ -151,7 +164,7 @@ def judge_components(
                 verdict[p] = UNPROVEN | MAYBE_DROPPED
         elif seeds[p] < smallest:
             verdict[p] = DROPPED
-        elif drops[p] > share * borders[p] and side < largest:
+        elif drops[p] + gentle * slow[p] > share * borders[p] and side < largest:
             verdict[p] = ROOF
     for k in range(len(state)):
         if patch[k] >= 0 and not state[k] & FIXED:
