@@ -136,7 +136,7 @@ def test_terrain_models_and_their_errors(found):
 
 def test_cases_follow_the_profiles():
     assert [c.name for c in cases(["smrf", "csf"], ["paper"])] == ["csf paper", "csf paper-smooth"]
-    assert [c.name for c in cases(["pmf"], ["all"])] == ["pmf default", "pmf paper", "pmf pdal"]
+    assert [c.name for c in cases(["pmf"], ["all"])] == ["pmf default", "pmf paper", "pmf paper-points", "pmf pdal"]
     assert {c.filter for c in cases(["all"])} == set(filters.names())
     assert len(cases(["smrf", "all", "smrf"])) == len(cases(["all"]))
     with pytest.raises(ParameterError, match="no filter has a profile papr"):

@@ -53,6 +53,36 @@ def test_oracle(pts, cell, window, slope, shape):
         assert expected is None or got == expected
 
 
+def oracle_on_points(pts, p):
+    """The PCL's loop: squares around the points that are left. None where the decision lies within float noise."""
+    left = list(range(len(pts)))
+    for radius, height in windows(p):
+        width = round(p.cell * 1000) * (2 * radius + 1)
+        near = {
+            i: [j for j in left if all(2 * abs(pts[i][axis] - pts[j][axis]) <= width for axis in (0, 1))] for i in left
+        }
+        eroded = {i: min(pts[j][2] for j in near[i]) for i in left}
+        margin = {i: max(eroded[j] for j in near[i]) + height * 1000 - pts[i][2] for i in left}
+        if any(abs(m) < 1e-6 for m in margin.values()):
+            return None
+        left = [i for i in left if margin[i] > 0]
+    return [i in left for i in range(len(pts))]
+
+
+@given(
+    points(extent=9_000),
+    st.sampled_from([0.999, 1.0, 1.5]),
+    st.sampled_from([3.0, 9.0, 10.0]),
+    st.sampled_from([5.0, 15.0, 45.0]),
+)
+@settings(deadline=None, max_examples=60)
+def test_oracle_on_points(pts, cell, window, slope):
+    params = PmfParams(cell=cell, window=window, slope=slope, shape="square", on="points")
+    expected = oracle_on_points(pts, params)
+    if len(set(pts)) >= 3 and expected is not None:
+        assert classify(cloud_of(pts), params).ground.tolist() == expected
+
+
 def test_windows_of_the_paper():
     tan15 = math.tan(math.radians(15))
     assert windows(PAPER) == [
@@ -85,5 +115,7 @@ def test_parameters_are_checked():
     assert required_buffer(PAPER) == pytest.approx(3 + 5 + 9 + 17 + 10)
     with pytest.raises(ParameterError, match=r"slope = 95.0 degrees is above"):
         PmfParams(slope=95.0)
+    with pytest.raises(ParameterError, match=r"on = 'points' knows squares only; set shape = 'square'"):
+        PmfParams(on="points")
     with pytest.raises(ParameterError, match=r"shape = 'round' is unknown"):
         PmfParams(shape="round")  # type: ignore[arg-type]

@@ -299,7 +299,7 @@ def removed_figure(
     xyz: npt.NDArray[np.float64],
     truth: Bools,
     voxel_params: VoxelParams,
-    pcom_params: PcomParams,
+    pcom_params: VoxelParams,
     axes: Axes | None = None,
 ) -> Axes:
     """Draw from above what PCOM removes that the plain voxel filter keeps.
@@ -310,8 +310,8 @@ def removed_figure(
         A plot's points, metres.
     truth : ndarray of bool, shape (n,)
         Which of them are ground.
-    voxel_params, pcom_params : VoxelParams, PcomParams
-        Parameters of the two filters.
+    voxel_params, pcom_params : VoxelParams
+        Parameters of the two filters; the latter's a `PcomParams`.
     axes : matplotlib.axes.Axes, optional
         Where to draw; a new figure by default.
 

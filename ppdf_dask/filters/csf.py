@@ -107,7 +107,10 @@ def classify(cloud: Cloud, params: Parameters) -> Verdict:
 
 
 def required_buffer(params: Parameters) -> float:
-    """Return 50 m, at least 50 particles: the cloth's stiffness carries about as far as it can sag."""
+    """Return 50 m, at least 50 particles. The cloth has no bound: it hangs at the corner of what is loaded.
+
+    With 50 m, 2.2 % of the points within 25 m of the seams of a sparse tile cut into 250 m chunks had two answers.
+    """
     assert isinstance(params, CsfParams)
     return max(50.0, 50.0 * params.resolution)
 

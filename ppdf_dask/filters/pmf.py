@@ -1,7 +1,8 @@
 """PMF: the progressive morphological filter.
 
 Zhang, Chen, Whitman, Shyu, Yan and Zhang, "A progressive morphological filter for removing nonground measurements from
-airborne LIDAR data", IEEE TGRS 41 (2003), 872-882, on a raster of lowest points as in the paper's section III.
+airborne LIDAR data", IEEE TGRS 41 (2003), 872-882, on a raster of lowest points as in the paper's section III, or on
+the points themselves as in the PCL, which the PPDF paper used.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from typing import Literal
 import numpy as np
 from scipy.ndimage import grey_opening
 
+from ppdf_dask.errors import ParameterError
 from ppdf_dask.filters import Filter
+from ppdf_dask.filters._pmf_points import below
 from ppdf_dask.filters.cloud import Bools, Cloud, Density, Verdict
 from ppdf_dask.filters.islands import by_island
 from ppdf_dask.filters.raster import EMPTY, Heights, dilated, eroded, filled, lowest, rasterize
@@ -25,8 +28,9 @@ from ppdf_dask.params import Parameters, quantity
 class PmfParams(Parameters):
     """Parameters of the progressive morphological filter.
 
-    Three profiles: the defaults are the tolerances of Table 2 of the PPDF paper with windows up to 33 m, so that houses
-    are opened as well as trees; ``paper`` is Table 2 itself; ``pdal`` the defaults of that software, for comparisons.
+    Four profiles: the defaults are the tolerances of Table 2 of the PPDF paper with windows up to 33 m, so that houses
+    are opened as well as trees; ``paper`` is Table 2 itself on a raster, ``paper-points`` on the points; ``pdal`` the
+    defaults of that software, for comparisons.
 
     Parameters
     ----------
@@ -40,6 +44,9 @@ class PmfParams(Parameters):
         Height above the opened surface from which a point is an object: in the first window, and at most.
     shape : {"diamond", "square"}
         Shape of the windows.
+    on : {"raster", "points"}
+        Raster: the surface is opened, empty cells filled. Points: for every point that is left, the lowest in the
+        square around it, then the highest of these in the square; squares only, nothing is filled.
     """
 
     cell: float = quantity(1.0, "m", low=0.05, high=100.0, doc="edge of a raster cell")
@@ -48,10 +55,19 @@ class PmfParams(Parameters):
     initial_height: float = quantity(0.5, "m", low=0.0, high=100.0, doc="height tolerance of the first window")
     max_height: float = quantity(3.0, "m", low=0.0, high=1000.0, doc="largest height tolerance")
     shape: Literal["diamond", "square"] = "diamond"
+    on: Literal["raster", "points"] = "raster"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.on == "points" and self.shape != "square":
+            raise ParameterError(f"on = 'points' knows squares only; set shape = 'square' instead of {self.shape!r}")
 
 
 PAPER = PmfParams(window=10.0, slope=15.0, initial_height=0.5, max_height=3.0, shape="square")
 """Table 2 of the PPDF paper, which used square windows; 10 m means the windows 3, 5, 9 and 17."""
+
+PAPER_POINTS = PAPER.replace(on="points")
+"""Table 2 of the PPDF paper with the program that it used: no raster."""
 
 PDAL = PmfParams(window=33.0, slope=45.0, initial_height=0.15, max_height=2.5)
 """The defaults of PDAL's filter: a first tolerance so tight that rough ground is lost, a slope that hardly limits."""
@@ -121,6 +137,8 @@ def required_buffer(params: Parameters) -> float:
 
 
 def _label(cloud: Cloud, params: PmfParams) -> Bools:
+    if params.on == "points":
+        return below(cloud, params.cell, [(radius, height * MM) for radius, height in windows(params)])
     raster = rasterize(cloud, params.cell)
     low = lowest(raster, cloud.z)
     surface = filled(np.where(low == EMPTY, np.nan, low), 1)
@@ -146,7 +164,7 @@ def _keep(params: Parameters, _: Density) -> Parameters:
 
 FILTER = Filter(
     name="pmf",
-    profiles={"default": PmfParams(), "paper": PAPER, "pdal": PDAL},
+    profiles={"default": PmfParams(), "paper": PAPER, "paper-points": PAPER_POINTS, "pdal": PDAL},
     classify=classify,
     required_buffer=required_buffer,
     exact=False,
