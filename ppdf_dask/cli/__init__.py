@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+from typing import Any
 
 import click
 
@@ -85,8 +87,21 @@ def _interrupts(error: BaseException | None) -> int:
     return found
 
 
+def _stop(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _stop_on_signals() -> None:
+    """Let an end that a queue or a closed terminal asks for be the same as Ctrl-C; who ignores it keeps doing so."""
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _stop)
+
+
 def main() -> None:
     """Run the command line; the console script."""
+    _stop_on_signals()
     try:
         group(standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt) as stop:
