@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-State = Literal["started", "stage", "sent", "done", "failed", "retried", "finished"]
+State = Literal["started", "stage", "sent", "done", "failed", "retried", "noted", "finished"]
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Event:
     state : str
         ``stage`` when a stage begins (`total` and `record` hold what is to do, ``record["resumed"]`` the ids done by
         an earlier run), ``sent`` when one piece of work goes to the cluster, ``done``, ``failed`` or ``retried`` when
-        it comes back, ``finished`` at the end.
+        it comes back, ``noted`` for what is odd (``record["warning"]``), ``finished`` at the end.
     ident : str
         Chunk id, source id or block id; empty for whole stages.
     points : int

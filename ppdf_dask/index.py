@@ -91,7 +91,8 @@ class Index:
             yield from (f"{group}/{chunk}" for chunk in store.children(group) if chunk not in owners)
         for source in store.children("labels"):
             kept = store.children(f"labels/{source}")
-            yield from (f"labels/{source}/{name}" for name in kept if int(name) >= self.labels.get(source, 0))
+            numbers = {f"{number:06d}" for number in range(self.labels.get(source, 0))}
+            yield from (f"labels/{source}/{name}" for name in kept if name not in numbers)
         for chunk in store.chunks():
             if chunk not in self.chunks:
                 yield f"chunks/{chunk}"

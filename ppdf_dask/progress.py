@@ -92,6 +92,8 @@ class TerminalProgress:
             self._bar.update(self._task, advance=event.points, note=note)
         elif event.state == "failed":
             self._console.print(f"{event.stage} {event.ident} failed: {event.record.get('error', '')}", markup=False)
+        elif event.state == "noted":
+            self._console.print(event.record["warning"], markup=False, highlight=False)
         elif event.state == "finished":
             self._end_stage()
 

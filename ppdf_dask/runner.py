@@ -26,6 +26,7 @@ from ppdf_dask.grid import MM, ChunkGrid
 from ppdf_dask.ledger import Ledger, digest
 from ppdf_dask.ledger import Stage as StageName
 from ppdf_dask.lock import hold
+from ppdf_dask.oddities import in_short, oddities
 from ppdf_dask.plan import Plan
 from ppdf_dask.quarantine import Failure, write_failures, write_json
 from ppdf_dask.raster import create
@@ -144,6 +145,10 @@ class _Run:
     def tile(self) -> None:
         """Cut the source files; afterwards a place without fragments is known to be empty."""
         self.tiles = self._stage("tile", tasks.tile, self.inputs.tile_works())
+        sources, unit = self.inputs.sources, self.plan.survey.unit_xy
+        self.odd = [p for s, record in self.tiles.items() for p in oddities(sources[s], record, unit)]
+        for line in in_short(self.odd):
+            self.on_event(Event("tile", "noted", record={"warning": line}))
         self.cutting = Cutting(self.inputs, self.store, self.tiles)
         self.cutting.index.publish(self.store)
 
@@ -266,6 +271,7 @@ class _Run:
             "platform": platform.platform(),
             "packages": {name: version(name) for name in PACKAGES},
             "inputs": [t.as_dict() for t in self.inputs.sources.values()],
+            "warnings": [problem_dict(p) for p in [*self.plan.survey.problems, *self.odd] if not p.fatal],
             "left_out": [problem_dict(p) for p in self.plan.survey.problems if p.fatal],
             "crs": self.plan.survey.crs,
             "plan": self.plan.facts(),

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 from ppdf_dask import __version__, filters
+from ppdf_dask.codeprint import code
 from ppdf_dask.dropped import are_dropped, kept_density
 from ppdf_dask.dtm import DtmGrid, Raster
 from ppdf_dask.execute import Work
@@ -62,6 +63,7 @@ class Inputs:
         p = self.plan
         return {
             "version": __version__,
+            "code": code(),
             "inputs": {t.name: [t.path, t.size, t.mtime_ns] for t in self.sources.values()},
             "crs": p.survey.crs,
             "units": [p.survey.unit_xy, p.survey.unit_z],
@@ -77,6 +79,7 @@ class Inputs:
         how = digest(
             [
                 __version__,
+                code(),
                 p.params.classes.as_dict() | {"returns": p.params.returns},
                 p.grid.size,
                 p.stored_buffer,

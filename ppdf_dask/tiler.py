@@ -237,11 +237,15 @@ class _Facts:
     eligible: int = 0
     bounds: Rect | None = None
     z: tuple[int, int] | None = None
+    no_returns: int = 0
+    odd_returns: int = 0
     classes: Int64 = field(default_factory=lambda: np.zeros(256, np.int64))
 
     def add(self, batch: Batch) -> None:
         self.points += len(batch.x)
         self.eligible += int(batch.eligible.sum())
+        self.no_returns += batch.no_returns
+        self.odd_returns += batch.odd_returns
         self.classes += np.bincount(batch.classification, minlength=256)
         if len(batch.x):
             here = Rect(int(batch.x.min()), int(batch.y.min()), int(batch.x.max()) + 1, int(batch.y.max()) + 1)
@@ -254,6 +258,8 @@ class _Facts:
         return {
             "points": self.points,
             "eligible": self.eligible,
+            "no_returns": self.no_returns,
+            "odd_returns": self.odd_returns,
             "bounds": None if b is None else [b.x0, b.y0, b.x1, b.y1],
             "z": None if self.z is None else list(self.z),
             "classes": {str(k): int(self.classes[k]) for k in np.flatnonzero(self.classes)},

@@ -55,7 +55,7 @@ class Command:
             mine = [e for e in events if e["stage"] == stage]
             if any(e["state"] == "done" for e in mine):
                 return
-            if mine and mine[-1]["record"].get("tasks") == 1:
+            if any(e["record"].get("tasks") == 1 for e in mine):
                 time.sleep(0.2)
                 return
             if self.process.poll() is not None:

@@ -399,6 +399,10 @@ def test_f38_changed_inputs_and_versions_are_refused_side_by_side(tiles, run, mo
     with pytest.raises(ResumeError, match=r"version: was .*, now 99"):
         small_plan(tiles, run).run(Inline())
     monkeypatch.undo()
+    monkeypatch.setattr(stages, "code", lambda: "0123456789ab")
+    with pytest.raises(ResumeError, match=r"code: was [0-9a-f]{12}, now 0123456789ab"):
+        small_plan(tiles, run).run(Inline())
+    monkeypatch.undo()
     fewer = run.parent / "fewer"
     fewer.mkdir()
     shutil.copy2(sorted(tiles.glob("*.laz"))[0], fewer)

@@ -233,6 +233,10 @@ def test_f7_f16_what_a_header_says_wrong_changes_nothing(tmp_path):
     assert [p.code for p in survey.problems] == ["wkt-bit"]
     result = plan(survey, params(), out=tmp_path / "run").run(Inline())
     assert result.tiles[0].read_bytes()[:227] == source.read_bytes()[:227]
+    said = {p["code"]: p["message"] for p in result.summary["warnings"]}
+    assert set(said) == {"wkt-bit", "bounds", "returns"}
+    assert said["bounds"].startswith("has points up to 10.00 m outside the bounds of its header")
+    assert said["returns"].startswith("has 800 points with return number 0 of 0")
     for each in (right, result):
         assert result.counts == right.counts
         classes = np.asarray(laspy.read(each.tiles[0]).classification)
