@@ -162,7 +162,7 @@ def measure(run: str | Path, tick: Tick = lambda chunk: None) -> Seams:
     if are_dropped(store):
         raise StoreError(f"the points of {run} were dropped; run again without --drop-intermediate into another folder")
     chosen = filters.of(cutting.filter)
-    band = plan.buffer // 2
+    band = cutting.buffer // 2
     strips: dict[tuple[str, str], Labels] = {}
     found: list[Seam] = []
     unproven = 0
@@ -181,7 +181,7 @@ def measure(run: str | Path, tick: Tick = lambda chunk: None) -> Seams:
             found.append(_compare(a, b, edge, strips.pop((a.id, b.id)), strip))
         tick(ident)
     seams = tuple(sorted(found, key=lambda s: (s.a, s.b)))
-    return Seams(chosen.name, chosen.exact, plan.buffer / MM, band / MM, unproven, seams)
+    return Seams(chosen.name, chosen.exact, cutting.buffer / MM, band / MM, unproven, seams)
 
 
 def _answer(store: RunStore, job: ClassifyJob, band: int) -> tuple[Labels, int]:

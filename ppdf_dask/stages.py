@@ -6,6 +6,7 @@ Pure bookkeeping over the plan and the ledger's records: nothing here runs anyth
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -176,26 +177,34 @@ class Cutting:
         return Cut(p.grid, p.stored_buffer, self.extent, self.unknown)
 
     @cached_property
+    def buffer(self) -> int:
+        """The buffer a chunk begins with, mm: the plan's, or the reach of a filter that proves nothing if it is wider.
+
+        The plan only estimates the density that a filter's lengths may follow from.
+        """
+        p, chosen = self.inputs.plan, filters.of(self.filter)
+        return p.buffer if chosen.exact else max(p.buffer, math.ceil(chosen.required_buffer(self.filter) * MM))
+
+    @cached_property
     def widest(self) -> int:
         """The widest buffer a chunk may try, mm."""
-        p = self.inputs.plan
-        return max(p.buffer, round(p.params.chunks.max_buffer * MM)) if filters.of(self.filter).exact else p.buffer
+        asked = round(self.inputs.plan.params.chunks.max_buffer * MM)
+        return max(self.buffer, asked) if filters.of(self.filter).exact else self.buffer
 
     # -- classify -------------------------------------------------------------------------------------------------
 
     @cached_property
     def classify_key(self) -> str:
         """Fingerprint of every classification: all tiles, the filter, and what is unknown."""
-        p = self.inputs.plan
         exact = filters.of(self.filter).exact
         keys = {s: self.inputs.tile_keys[s] for s in self.tiles}
         unknown = [[r.x0, r.y0, r.x1, r.y1] for r in self.unknown]
-        return digest([keys, unknown, self.filter.as_dict(), None if exact else p.buffer])
+        return digest([keys, unknown, self.filter.as_dict(), None if exact else self.buffer])
 
     def classify_job(self, chunk: str) -> ClassifyJob:
         """Return what a worker needs to classify a chunk."""
         p = self.inputs.plan
-        return ClassifyJob(p.grid.parse(chunk), self.cut, self.filter, p.buffer, self.widest, p.most_points)
+        return ClassifyJob(p.grid.parse(chunk), self.cut, self.filter, self.buffer, self.widest, p.most_points)
 
     def classify_works(self) -> list[Work]:
         """Return the work of the classify stage, densest chunk first."""

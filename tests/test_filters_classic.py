@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
+import re
 from pathlib import Path
 
 import laspy
@@ -12,6 +14,7 @@ from classic_clouds import cloud_of, nasty, points
 from hypothesis import given, settings
 
 from ppdf_dask import filters
+from ppdf_dask.errors import ParameterError
 from ppdf_dask.filters import msf, pmf, ptdf, smrf
 from ppdf_dask.filters.cloud import Cloud, cloud_from_xyz
 
@@ -72,6 +75,24 @@ def test_surroundings_count_but_only_the_core_is_classified(name, pts):
     assert chosen.classify(part, params).ground.tolist() == expected.tolist()
 
 
+@pytest.mark.parametrize("name", ["csf", "msf", "pcom", "pmf", "ppdf", "ptdf", "smrf", "voxel"])
+def test_wrong_values_are_refused_with_their_unit(name):
+    checked = 0
+    for params in filters.get(name).profiles.values():
+        for field in dataclasses.fields(params):
+            unit, low, high = (field.metadata.get(k) for k in ("unit", "low", "high"))
+            if unit is None:
+                continue
+            for bound, wrong, side in ((low, -1, "below"), (high, 1, "above")):
+                if bound is not None:
+                    with pytest.raises(ParameterError, match=rf"{field.name} = .* {re.escape(unit)} is {side} the"):
+                        params.replace(**{field.name: bound + wrong})
+                    checked += 1
+            with pytest.raises(ParameterError, match=f"{field.name} = 'x' is not a finite number of {re.escape(unit)}"):
+                params.replace(**{field.name: "x"})
+    assert checked >= 4
+
+
 @pytest.mark.parametrize("name", ["msf", "pmf", "csf", "ptdf", "smrf"])
 def test_registered(name):
     found = filters.get(name)
@@ -94,39 +115,59 @@ def load(name):
     return np.asarray(tile.xyz), seen, mark == 0, np.asarray(tile.classification) == 2
 
 
-# Total error in % of PDAL 2.10 (SMRF, PMF, CSF) and lasR 0.21 (PTD) at their defaults, and how far ours may be from it.
-# Their rasters hang at the cloud's corner, ours at absolute cells: the clouds are moved so that both are the same. What
-# remains: of equally near cells they fill a gap with any, we with the mean of all; heights on a tolerance to the
-# centimetre (0.15 m in PMF) fall either way in floating point, and always out in integers; lasR adds points in the
-# order of their height, not facet by facet.
-PEERS = [
-    ("smrf", "default", "isprs_samp11", 9.92, 0.2),
-    ("smrf", "default", "isprs_samp12", 3.15, 0.2),
-    ("smrf", "default", "isprs_samp31", 3.39, 0.2),
-    ("smrf", "default", "isprs_samp51", 5.60, 0.2),
-    ("smrf", "default", "pdal_utm42_mountain", 4.43, 0.2),
-    ("smrf", "default", "pyfor_test", 6.73, 0.2),
-    ("smrf", "default", "fontblanche_m30", 1.02, 0.2),
-    ("pmf", "pdal", "isprs_samp12", 5.91, 1.3),
-    ("pmf", "pdal", "isprs_samp31", 4.05, 1.3),
-    ("pmf", "pdal", "pdal_utm42_mountain", 21.45, 1.3),
-    ("pmf", "pdal", "lidR_topography", 9.58, 1.3),
-    ("pmf", "pdal", "fontblanche_m30", 3.32, 1.3),
-    ("ptdf", "lasr", "isprs_samp12", 10.25, 1.0),
-    ("ptdf", "lasr", "isprs_samp31", 10.72, 1.0),
-    ("ptdf", "lasr", "fontblanche_m30", 2.54, 1.0),
-    ("csf", "default", "fontblanche_m30", 1.09, 0.05),
-]
+# Total error in % of PDAL 2.10 (SMRF, PMF, CSF) and lasR 0.21 (PTD), each at its defaults on last and only returns.
+PEERS = {
+    "isprs_samp11": (9.92, 17.16, 38.21, 18.48),
+    "isprs_samp12": (3.15, 5.91, 7.54, 10.25),
+    "isprs_samp31": (3.39, 4.05, 8.10, 10.72),
+    "isprs_samp51": (5.60, 6.89, 18.80, 3.02),
+    "isprs_samp53": (4.36, 10.91, 39.92, 12.19),
+    "isprs_samp61": (1.01, 4.87, 12.42, 2.89),
+    "fontblanche_m30": (1.02, 3.32, 1.09, 2.54),
+    "ignhd_crop1": (0.06, 10.96, 0.91, 45.25),
+    "pdal_utm42_mountain": (4.43, 21.45, 41.34, 4.41),
+    "pyfor_test": (6.73, 20.64, 6.97, 13.41),
+    "ignhd_dec_0292_6833": (6.16, 6.02, 5.17, 5.63),
+    "bcts_1": (16.54, 1.43, 13.62, 5.92),
+    "bcts_3": (15.30, 1.83, 14.21, 5.82),
+    "lidR_topography": (12.32, 9.58, 9.63, 10.36),
+}
+
+# How far ours may be from theirs, in points: on any cloud, and in the mean. Their rasters hang at the cloud's corner,
+# ours at absolute cells: the clouds are moved so that both are the same. What remains: of equally near cells they fill
+# a gap with any, we with the mean of all; heights on a tolerance to the centimetre (0.15 m in PMF) fall either way in
+# floating point, and always out in integers; lasR adds points one by one in the order of their height instead of the
+# best of each facet, and removes spikes at the end: 3.9 points apart on the quarry's break lines (samp53).
+FARTHEST = {"smrf": (0.2, 0.1), "pmf": (1.3, 0.4), "csf": (0.4, 0.1), "ptdf": (4.0, 0.9)}
+PROFILES = {"smrf": "default", "pmf": "pdal", "csf": "default", "ptdf": "lasr"}
 
 
-@pytest.mark.parametrize(("name", "profile", "cloud", "peer", "distance"), PEERS)
-def test_agreement_with_the_peers(name, profile, cloud, peer, distance):
+def distance_to_the_peer(name, cloud):
+    """Total error of ours less theirs, points."""
     if name == "csf":
         pytest.importorskip("CSF", reason="the extra csf is not installed")
     xyz, seen, scored, reference = load(cloud)
     ground = np.zeros(len(xyz), bool)
     found = filters.get(name)
     at_corner = xyz[seen] - xyz[seen].min(axis=0)
-    ground[seen] = found.classify(cloud_from_xyz(at_corner), found.profiles[profile]).ground
+    ground[seen] = found.classify(cloud_from_xyz(at_corner), found.profiles[PROFILES[name]]).ground
     total = 100 * np.mean(ground[scored] != reference[scored])
-    assert total == pytest.approx(peer, abs=distance)
+    return total - PEERS[cloud][list(FARTHEST).index(name)]
+
+
+@pytest.mark.parametrize("cloud", ["isprs_samp12", "isprs_samp31", "pdal_utm42_mountain", "fontblanche_m30"])
+@pytest.mark.parametrize("name", ["smrf", "pmf", "ptdf"])
+def test_agreement_with_the_peers(name, cloud):
+    assert abs(distance_to_the_peer(name, cloud)) <= FARTHEST[name][0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FARTHEST)
+def test_agreement_with_the_peers_on_every_cloud(name):
+    away = {cloud: distance_to_the_peer(name, cloud) for cloud in PEERS}
+    size = np.abs(list(away.values()))
+    print(*(f"{name} {cloud} {d:+.2f}" for cloud, d in away.items()), sep="\n")
+    print(f"{name}: {size.max():.2f} at most, {size.mean():.2f} in the mean")
+    most, mean = FARTHEST[name]
+    assert size.max() <= most
+    assert size.mean() <= mean

@@ -8,9 +8,11 @@ import pytest
 
 from ppdf_dask import filters
 from ppdf_dask.filters import classify_ground
+from ppdf_dask.filters.cloud import cloud_from_xyz, density
 from ppdf_dask.params import ChunkParams, ClassRules, RunParams
 from ppdf_dask.plan import plan
 from ppdf_dask.seams import measure
+from ppdf_dask.store import RunStore
 from ppdf_dask.survey import scan
 from ppdf_dask.synthetic import terrestrial_plot
 
@@ -28,16 +30,35 @@ SMALL = {
 }
 
 
+def tile(path, xyz):
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.header.scales = [0.001] * 3
+    las.x, las.y, las.z = xyz.T
+    las.write(path)
+    return path
+
+
 @pytest.fixture(scope="module")
 def plot(tmp_path_factory):
     """A terrestrial plot as one tile."""
     xyz, _ = terrestrial_plot("slope", seed=3, edge=20.0, density=150.0)
-    las = laspy.create(point_format=6, file_version="1.4")
-    las.header.scales = [0.001] * 3
-    las.x, las.y, las.z = xyz.T
-    path = tmp_path_factory.mktemp("plot") / "plot.laz"
-    las.write(path)
-    return [path]
+    return [tile(tmp_path_factory.mktemp("plot") / "plot.laz", xyz)]
+
+
+@pytest.mark.filterwarnings("ignore:resolution = 0.1 m is too fine")
+def test_the_buffer_follows_the_density_that_was_found(client, tmp_path):
+    # Moved by half a cell the plot lies in 25 cells of 5 m instead of the 16 that its bounds suggest.
+    xyz, _ = terrestrial_plot("flat", seed=3, edge=20.0, density=40.0)
+    params = filters.parameters("pcom").replace(resolution=0.1)
+    made = plan(scan([tile(tmp_path / "moved.laz", xyz + 2.5)]), RunParams(filter=params), out=tmp_path / "run")
+    made.run(client)
+    chosen = filters.of(params)
+    found = measure(tmp_path / "run")
+    resolved = chosen.resolve(params, density(cloud_from_xyz(xyz + 2.5)))
+    assert chosen.required_buffer(resolved) > made.buffer / 1000
+    assert found.buffer_m == pytest.approx(chosen.required_buffer(resolved), abs=0.001)
+    records = [r for _, r in RunStore(str(tmp_path / "run" / "run.zarr")).records("classify")]
+    assert {r["buffer_m"] for r in records} == {found.buffer_m}
 
 
 @pytest.mark.parametrize("name", SMALL)
