@@ -100,16 +100,20 @@ class Plan:
         return _estimate(self.survey, self.grid, self.buffer, self.params.returns == "last")
 
     @property
+    def bytes_per_point(self) -> float:
+        """Memory a task needs for each point it loads, in bytes: as read, as joined, and the filter's own."""
+        return _bytes_per_point(self.params)
+
+    @property
     def most_points(self) -> float:
         """Points a task may load at once; a chunk with more is worked on in quarters."""
-        return max(0.0, self.memory - WORKER_MB * 1e6) / (24.0 + filters.of(self.params.filter).bytes_per_point)
+        return max(0.0, self.memory - WORKER_MB * 1e6) / self.bytes_per_point
 
     @property
     def task_mb(self) -> float:
         """Expected peak of the largest task, MB, the worker itself included."""
         loaded = max((c.loaded for c in self.chunks), default=0.0)
-        per_point = 24.0 + filters.of(self.params.filter).bytes_per_point
-        return WORKER_MB + max(loaded * per_point, BATCH_POINTS * TILE_BYTES) / 1e6
+        return WORKER_MB + max(loaded * self.bytes_per_point, BATCH_POINTS * TILE_BYTES) / 1e6
 
     @property
     def disk_mb(self) -> dict[str, float]:
@@ -299,6 +303,10 @@ def plan(
     return Plan(survey, params, Path(out).absolute(), grid, width, memory)
 
 
+def _bytes_per_point(params: RunParams) -> float:
+    return 24.0 + filters.of(params.filter).bytes_per_point
+
+
 def _eligible(tile: Tile, last: bool) -> float:
     """Points a tile offers: last and only returns are as many as the pulses, which the header counts."""
     pulses = tile.first_returns
@@ -345,8 +353,7 @@ def _choose(survey: Survey, params: RunParams, buffer: int, memory: float) -> Ch
 
     Enough does not grow with the survey, so that the memory of a worker and the time per point do not either.
     """
-    per_point = 24.0 + filters.of(params.filter).bytes_per_point
-    fits = (0.6 * memory - WORKER_MB * 1e6) / per_point
+    fits = (0.6 * memory - WORKER_MB * 1e6) / _bytes_per_point(params)
     last = params.returns == "last"
     total = sum(_eligible(t, last) for t in survey.tiles)
     densest = max((_eligible(t, last) / max(_extent(t), 1) for t in survey.tiles), default=0.0)

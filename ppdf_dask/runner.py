@@ -289,6 +289,7 @@ class _Run:
             "memory": {
                 "planned_task_mb": round(self.plan.task_mb),
                 "limit_mb": round(self.plan.memory / 1e6),
+                "bytes_per_point": self.plan.bytes_per_point,
                 "peak_mb": max(s["peak_mb"] for s in self.totals.values()),
             },
         }

@@ -218,8 +218,7 @@ class Cutting:
 
     def need_mb(self, chunk: str) -> float:
         """Return the memory a worker needs for a chunk with its first buffer, MB."""
-        per_point = 24.0 + filters.of(self.filter).bytes_per_point
-        return round(WORKER_MB + self.index.loaded(chunk) * per_point / 1e6)
+        return round(WORKER_MB + self.index.loaded(chunk) * self.inputs.plan.bytes_per_point / 1e6)
 
     # -- merge ----------------------------------------------------------------------------------------------------
 

@@ -432,4 +432,5 @@ def test_run_json_tells_versions_and_peak_memory(run):
     assert {"zarr", "dask", "laspy"} <= report["packages"].keys()
     assert 0 < report["memory"]["peak_mb"] < report["memory"]["limit_mb"]
     assert report["memory"]["planned_task_mb"] > 0
+    assert report["memory"]["bytes_per_point"] > 24
     assert finished(run) >= {"cog-dtm.tif"}

@@ -341,15 +341,17 @@ class ScaleTable:
 
 def study(sizes: list[float], workers: list[int], folder: Path, params: RunParams, tick: Tick) -> ScaleTable:
     """Measure all sizes with all numbers of workers; tiles and runs stay in `folder`."""
+    places = {points: folder / f"{points / 1e6:g}M" for points in sizes}
+    # By workers of their own: what generating leaves in a process would count as memory of the job.
+    with cluster(max(workers)) as (client, _):
+        warm = make_survey(client, folder / "warm", 1e6)
+        tiles = {points: make_survey(client, place, points) for points, place in places.items()}
     rows = []
     for count in workers:
         with cluster(count) as (client, pids):
-            warm = make_survey(client, folder / "warm", 1e6)
             for _ in range(2):
                 measure(client, pids, warm, folder / "warm", params)
-            for points in sizes:
-                place = folder / f"{points / 1e6:g}M"
-                tiles = make_survey(client, place, points)
-                rows.append(measure(client, pids, tiles, place, params))
+            for points, place in places.items():
+                rows.append(measure(client, pids, tiles[points], place, params))
                 tick(f"{points / 1e6:g} million points, {count} workers")
     return ScaleTable(tuple(sorted(rows, key=lambda r: (r.points, r.workers))))
