@@ -81,7 +81,7 @@ class Command:
 def start(arguments: list[object], **environment: str) -> subprocess.Popen[str]:
     variables = {
         "DASK_DISTRIBUTED__WORKER__PRELOAD": json.dumps([str(HERE / "slow_preload.py")]),
-        "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "4s",
+        "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "10s",
         "FAULTY_SLEEP": "0.0",
     }
     return subprocess.Popen(
