@@ -9,5 +9,4 @@ workers = {"n_workers": 20, "worker_memory": "8 GiB", "worker_options": {"nthrea
 with coiled.Cluster(**workers) as cluster, cluster.get_client() as client:
     memory = preflight.worker_memory(client, wait=900)
     plan = ppdf_dask.plan(ppdf_dask.scan("/mnt/survey/tiles"), out="/mnt/survey/run", memory=memory)
-    preflight.check(client, plan)
     print(plan.run(client))

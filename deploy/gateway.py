@@ -9,5 +9,4 @@ with Gateway().new_cluster() as cluster, cluster.get_client() as client:
     cluster.scale(20)
     memory = preflight.worker_memory(client, wait=900)
     plan = ppdf_dask.plan(ppdf_dask.scan("/shared/tiles"), out="/shared/run", memory=memory)
-    preflight.check(client, plan)
     print(plan.run(client))

@@ -93,6 +93,11 @@ class _Flight:
     suspects: list[Work] = field(default_factory=list)
     room: int = 0
     asked: float = float("-inf")
+    address: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        # A client that was closed no longer knows it.
+        self.address = str(getattr(self.client.scheduler, "address", "?"))
 
     def submit(self, work: Work) -> None:
         """Send one piece of work to the cluster."""
@@ -172,9 +177,8 @@ class _Flight:
             raise
 
     def _lost(self, work: Work | None) -> ClusterError:
-        scheduler = self.client.scheduler
         return ClusterError(
-            f"the scheduler at {scheduler.address if scheduler else '?'} was lost during {self.stage.name}"
+            f"the scheduler at {self.address} was lost during {self.stage.name}"
             f"{f' {work.ident}' if work else ''}; start it again and give the same command, it goes on where it stopped"
         )
 

@@ -24,6 +24,7 @@ PALETTE: Mapping[str, str] = {
     "sky": "#56B4E9",
     "yellow": "#F0E442",
     "grey": "#999999",
+    "pale": "#E5E5E5",
 }
 """Colours that people with any colour vision can tell apart (Okabe and Ito, 2008, Color Universal Design)."""
 
@@ -51,7 +52,9 @@ class Patch:
     colour: str = "blue"
 
 
-def svg_map(patches: Sequence[Patch], *, width: int = 480, legend: Mapping[str, str] | None = None) -> str:
+def svg_map(
+    patches: Sequence[Patch], *, width: int = 480, legend: Mapping[str, str] | None = None, opacity: float = 0.45
+) -> str:
     """Draw rectangles, north up.
 
     Parameters
@@ -63,6 +66,8 @@ def svg_map(patches: Sequence[Patch], *, width: int = 480, legend: Mapping[str, 
         Pixels; the height follows the extent, at most twice the width.
     legend : mapping of str to str, optional
         Text by colour.
+    opacity : float
+        Of the patches, and of the legend's; less than 1 where patches lie over each other.
 
     Returns
     -------
@@ -91,12 +96,14 @@ def svg_map(patches: Sequence[Patch], *, width: int = 480, legend: Mapping[str, 
         w, h = max(r.width * scale, 1.0), max(r.height * scale, 1.0)
         parts.append(
             f'<rect x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{h:.1f}" fill="{_hex(patch.colour)}" '
-            f'fill-opacity="0.45" stroke="#333333" stroke-width="0.5"><title>{_text(patch.label)}</title></rect>'
+            f'fill-opacity="{opacity:g}" stroke="#333333" stroke-width="0.5"><title>{_text(patch.label)}</title></rect>'
         )
     rows = []
     for k, (colour, text) in enumerate((legend or {}).items()):
         y = height + 8 + 18 * k
-        rows.append(f'<rect x="2" y="{y}" width="12" height="12" fill="{_hex(colour)}" stroke="#333333"/>')
+        rows.append(
+            f'<rect x="2" y="{y}" width="12" height="12" fill="{_hex(colour)}" opacity="{opacity:g}" stroke="#333333"/>'
+        )
         rows.append(f'<text x="20" y="{y + 11}" font-size="12" font-family="sans-serif">{_text(text)}</text>')
     total = height + (10 + 18 * len(legend) if legend else 0)
     view = f'viewBox="-2 -2 {width + 4} {total + 4}" width="{width + 4}" height="{total + 4}"'

@@ -169,7 +169,7 @@ class Plan:
         accept_changes: bool = False,
         force_unlock: bool = False,
     ) -> Result:
-        """Run the plan on a cluster; an interrupted run goes on where it stopped.
+        """Ask all workers whether they can do it, then run; an interrupted run goes on where it stopped.
 
         Parameters
         ----------
@@ -191,11 +191,16 @@ class Plan:
         ------
         PlanError, ResumeError
             Before any work is done.
+        ClusterError
+            Before any work when a worker cannot do its part (see `preflight`); later when the cluster is lost.
         PartialRunError
             Some chunks or tiles failed; the others are done.
         """
+        from ppdf_dask import preflight
         from ppdf_dask.runner import run
 
+        self.check()
+        preflight.check(client, self)
         return run(
             self,
             client,

@@ -32,10 +32,10 @@ CLASSES = {
     7: ("noise", PALETTE["pink"]),
     9: ("water", PALETTE["blue"]),
 }
-"""Name and colour of a class in a section; 3 to 5 are drawn as 1, 0 too, 18 as 7, any other class in grey."""
+"""Name and colour of a class in a section; 3 to 5 are drawn as 1, 0 too, 18 as 7, any other class in light blue."""
 
 _SAME = {0: 1, 3: 1, 4: 1, 5: 1, 18: 7}
-_OTHER = ("other classes", PALETTE["grey"])
+_OTHER = ("other classes", PALETTE["sky"])
 
 
 def survey_map(survey: Survey, ax: Axes | None = None) -> Axes:
@@ -85,6 +85,7 @@ def plan_map(plan: Plan, ax: Axes | None = None) -> Axes:
     ax = _axes(ax)
     squares = PatchCollection([_rectangle(c.core, Rectangle) for c in plan.chunks], cmap="cividis", edgecolor="white")
     squares.set_array(np.array([c.loaded for c in plan.chunks]) / 1e6)
+    squares.set_clim(vmin=0)
     ax.add_collection(squares)
     _figure(ax).colorbar(squares, ax=ax, label="million points loaded, with buffer")
     tiles = [t.bounds for t in plan.survey.tiles if t.point_count]
@@ -296,7 +297,16 @@ def draw_section(along: NDArray[Any], z: NDArray[Any], classes: NDArray[Any], ax
         here = shown == kind
         ax.scatter(along[here], z[here], s=size, c=colour, linewidths=0, label=f"{name}, {here.sum():,}")
     ax.set(xlabel="distance along the line", ylabel="height")
-    ax.legend(loc="upper right", fontsize="small", markerscale=4, framealpha=0.9)
+    # Above the axes: terrain may rise anywhere inside.
+    ax.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=5,
+        fontsize="small",
+        markerscale=4,
+        frameon=False,
+        borderpad=0,
+    )
     return ax
 
 

@@ -15,6 +15,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +50,7 @@ class Needs:
     token : str
         Name of the folder in it that the check uses.
     tiles : tuple of Tile
-        Some of the source files.
+        Some of the source files, as the client sees them.
     task_mb : float
         Planned peak of the largest task, MB.
     """
@@ -78,6 +79,14 @@ class Fault:
     remedy: str
 
 
+@cache
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "missing"
+
+
 def versions() -> dict[str, str]:
     """Return the versions that must be equal on client, scheduler and workers.
 
@@ -87,12 +96,7 @@ def versions() -> dict[str, str]:
     ['dask', 'distributed', 'laspy']
     """
     found = {"python": ".".join(platform.python_version_tuple()[:2]), "ppdf-dask": __version__}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "missing"
-    return found
+    return found | {name: _version(name) for name in PACKAGES}
 
 
 def check(client: Client, plan: Plan, *, wait: float = WAIT) -> None:
@@ -252,12 +256,22 @@ def _meeting_place(plan: Plan) -> Iterator[Needs]:
         raise ClusterError(f"{out} cannot be written here ({error.strerror}); choose another --out") from error
     try:
         (out / token / "client").write_text(token, encoding="utf-8")
-        yield Needs(str(out), token, plan.survey.tiles[::step], plan.task_mb)
+        # A tile that changed here as well is no worker's fault: the run sets it aside by name.
+        seen = tuple(tile for tile in plan.survey.tiles[::step] if _is_unchanged(tile))
+        yield Needs(str(out), token, seen, plan.task_mb)
     finally:
         shutil.rmtree(out / token, ignore_errors=True)
         if fresh:
             with suppress(OSError):
                 out.rmdir()
+
+
+def _is_unchanged(tile: Tile) -> bool:
+    try:
+        tile.check_unchanged()
+    except PpdfError:
+        return False
+    return True
 
 
 def _try_folder(out: Path, token: str, note: str, faults: list[tuple[str, str, str]]) -> bool:

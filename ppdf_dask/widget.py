@@ -15,8 +15,11 @@ from ppdf_dask.progress import TITLES, rate
 if TYPE_CHECKING:
     from ppdf_dask.plan import Plan
 
-STATES = {"waiting": "grey", "in the cluster": "sky", "tried again": "orange", "done": "green", "failed": "red"}
+STATES = {"waiting": "pale", "in the cluster": "sky", "tried again": "orange", "done": "green", "failed": "red"}
 """State of a piece of work and its colour."""
+
+OPACITY = 0.85
+"""Of the pieces: fainter, grey and green look alike to readers who confuse red and green."""
 
 _BY_TILE = ("tile", "merge")
 
@@ -89,7 +92,7 @@ class LiveMap:
         legend = {colour: f"{'tile' if by_tile else 'chunk'} {state}" for state, colour in STATES.items()}
         rows = "".join(bar.html() for bar in self._stages.values())
         end = f"<p>{escape(self._end)}</p>" if self._end else ""
-        return f"<div>{svg_map(patches, width=420, legend=legend)}<table>{rows}</table>{end}</div>"
+        return f"<div>{svg_map(patches, width=420, legend=legend, opacity=OPACITY)}<table>{rows}</table>{end}</div>"
 
     def show(self) -> None:
         """Display the map in the notebook; it is redrawn in place from then on.

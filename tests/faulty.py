@@ -32,6 +32,12 @@ class Inline:
         self.ran: list[str] = []
         self._fault = fault
 
+    def wait_for_workers(self, n_workers: int, timeout: float) -> None:
+        pass
+
+    def run(self, function: Any, *args: Any, on_error: str) -> dict[str, Any]:
+        return {"inline": function(*args)}
+
     def nthreads(self) -> dict[str, int]:
         return {"inline": 1}
 

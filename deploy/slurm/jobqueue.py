@@ -65,7 +65,6 @@ def main() -> None:
             for line in dashboard(client):
                 console.print(line, markup=False)
             plan = ppdf_dask.plan(survey, params, out=options.out, memory=preflight.worker_memory(client, wait=86_400))
-            preflight.check(client, plan)
             with listen(console) as listener:
                 print(plan.run(client, on_event=listener))
     finally:

@@ -51,7 +51,6 @@ def work(client: Client, options: argparse.Namespace) -> None:
     survey = ppdf_dask.scan(options.tiles)
     params = ppdf_dask.RunParams(chunks=ppdf_dask.ChunkParams(chunk_size=options.chunk_size))
     plan = ppdf_dask.plan(survey, params, out=options.out, memory=preflight.worker_memory(client))
-    preflight.check(client, plan)
     with listen(Console(stderr=True)) as listener:
         print(plan.run(client, on_event=listener))
 

@@ -198,7 +198,6 @@ def _memory(cluster: dict[str, Any]) -> float:
 def _run(made: Plan, cluster: dict[str, Any], **how: bool) -> Result:
     from rich.console import Console
 
-    from ppdf_dask import preflight
     from ppdf_dask.cluster import dashboard
     from ppdf_dask.progress import listen
 
@@ -207,5 +206,4 @@ def _run(made: Plan, cluster: dict[str, Any], **how: bool) -> Result:
         if not cluster["quiet"]:
             for line in dashboard(client):
                 console.print(line, highlight=False, markup=False)
-        preflight.check(client, made)
         return made.run(client, on_event=listener, **how)
