@@ -198,7 +198,9 @@ def _bars(found: Comparison, columns: Sequence[tuple[str, Callable[[Row], float]
         axes.spines[["top", "right"]].set_visible(False)
         if log:
             axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            low, high = axes.get_xlim()
+            # Over three decades the labels of 2 and 5 would run into each other.
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_formatter("")
     panels[0].set_yticks(range(len(cases)), cases)
