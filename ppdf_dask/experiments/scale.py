@@ -41,6 +41,9 @@ TILE = 500
 EDGE = (500_000, 5_400_000)
 """South-west corner of every survey, m."""
 
+WARM_UP = (EDGE[0], EDGE[1], EDGE[0] + 500, EDGE[1] + 250)
+"""Extent of the job that comes first: 8 small tiles and at least two of anything else, so that all workers are warm."""
+
 Tick = Callable[[str], None]
 
 
@@ -59,13 +62,15 @@ def extent_of(points: float) -> tuple[float, float, float, float]:
     return float(x), float(y), float(x + columns * TILE), float(y + rows * TILE)
 
 
-def make_survey(client: Client, folder: Path, points: float) -> list[Path]:
+def make_survey(
+    client: Client, folder: Path, extent: tuple[float, float, float, float], tile: int = TILE
+) -> list[Path]:
     """Generate a survey's tiles on the workers unless they are there already."""
     from ppdf_dask.synthetic.tiles import tile_rects
 
     made = [
-        client.submit(_make_tile, str(folder), rect, key=f"generate-{k}-{points}")
-        for k, rect in enumerate(tile_rects(extent_of(points), TILE))
+        client.submit(_make_tile, str(folder), rect, key=f"generate-{folder.name}-{k}")
+        for k, rect in enumerate(tile_rects(extent, tile))
     ]
     return [Path(path) for path in client.gather(made)]
 
@@ -344,8 +349,8 @@ def study(sizes: list[float], workers: list[int], folder: Path, params: RunParam
     places = {points: folder / f"{points / 1e6:g}M" for points in sizes}
     # By workers of their own: what generating leaves in a process would count as memory of the job.
     with cluster(max(workers)) as (client, _):
-        warm = make_survey(client, folder / "warm", 1e6)
-        tiles = {points: make_survey(client, place, points) for points, place in places.items()}
+        warm = make_survey(client, folder / "warm", WARM_UP, 125)
+        tiles = {points: make_survey(client, place, extent_of(points)) for points, place in places.items()}
     rows = []
     for count in workers:
         with cluster(count) as (client, pids):
