@@ -71,6 +71,9 @@ def local_cluster(workers: int | None = None) -> Iterator[Client]:
     config = {
         "distributed.nanny.pre-spawn-environ": {**before, **SINGLE},
         "distributed.worker.daemon": True,
+        # Dask gives up a worker's place for good when it is empty 15 seconds after a death, also when the next worker
+        # died meanwhile or starts slowly on a busy machine: in the end nobody is left and the run waits for ever.
+        "distributed.deploy.lost-worker-timeout": "365 days",
         "distributed.worker.preload": [*dask.config.get("distributed.worker.preload"), "ppdf_dask.quiet_worker"],
     }
     with (
