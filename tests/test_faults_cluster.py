@@ -82,6 +82,8 @@ def start(arguments: list[object], **environment: str) -> subprocess.Popen[str]:
     variables = {
         "DASK_DISTRIBUTED__WORKER__PRELOAD": json.dumps([str(HERE / "slow_preload.py")]),
         "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "10s",
+        # With Dask's own way with lost workers, no worker would ever come back: ours has to win.
+        "DASK_DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "100ms",
         "FAULTY_SLEEP": "0.0",
     }
     return subprocess.Popen(
