@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +17,7 @@ from ppdf_dask.filters.ppdf.robust.params import RobustParams
 from ppdf_dask.filters.ppdf.robust.patches import judge_components, link_patches, spread_roofs
 from ppdf_dask.filters.ppdf.robust.planes import find_planes
 from ppdf_dask.filters.ppdf.robust.roughness import local_roughness
+from ppdf_dask.filters.ppdf.robust.surface import room_for_index
 from ppdf_dask.filters.ppdf.robust.windows import fits_one_grid, in_windows
 from ppdf_dask.grid import MM
 
@@ -26,6 +29,9 @@ NEAR = 3
 
 AGREE = 1.0
 """Metres: two low points agree when each lies this near to the other's plane."""
+
+CACHED_CELLS = 1 << 15
+"""A larger grid does not fit a processor's cache: its points are taken row by row, whatever the file's order."""
 
 ROUGH_REACH = 5
 """Cells on each side over which the roughness is taken."""
@@ -68,6 +74,30 @@ def classify(cloud: Cloud, params: RobustParams) -> Verdict:
 
 def classify_area(cloud: Cloud, params: RobustParams) -> Verdict:
     """Classify on one dense grid over all points of the cloud; `classify` without its guard."""
+    height, width = (int(v.max()) - int(v.min()) for v in (cloud.y, cloud.x))
+    if height // params.cell_mm * (width // params.cell_mm) < CACHED_CELLS:
+        return _classify_in_order(cloud, params)
+    order = _by_rows(cloud, params.cell_mm)
+    core, fixed = order[: cloud.n_core], None if cloud.fixed is None else cloud.fixed[order]
+    found = _classify_in_order(
+        replace(cloud, x=cloud.x[order], y=cloud.y[order], z=cloud.z[order], fixed=fixed), params
+    )
+    ground, unproven = np.empty_like(found.ground), np.empty_like(found.unproven)
+    ground[core], unproven[core] = found.ground, found.unproven
+    return Verdict(ground, unproven)
+
+
+def _by_rows(cloud: Cloud, cell: int) -> npt.NDArray[np.int64]:
+    """Return an order of the points, core first, in which those of a row of cells follow each other."""
+    rows = (cloud.y - cloud.y.min()) // cell
+    if rows.max() < 1 << 16:  # sixteen bits are sorted in linear time
+        rows = rows.astype(np.uint16)
+    n = cloud.n_core
+    return np.concatenate([np.argsort(rows[:n], kind="stable"), n + np.argsort(rows[n:], kind="stable")])
+
+
+def _classify_in_order(cloud: Cloud, params: RobustParams) -> Verdict:
+    """Classify points in the order they come in: no label depends on it, but speed does where the grid is large."""
     cell = params.cell_mm
     rings = -(-round(params.search_radius * MM) // cell)
     cells = cells_.build(cloud, cell, max(rings, LOOK_OUT) + 1)
@@ -80,7 +110,7 @@ def classify_area(cloud: Cloud, params: RobustParams) -> Verdict:
     residuals = np.empty(len(state), np.int32)
     limit2 = round(params.search_radius * MM) ** 2
     drop = "cleaning" in params.steps
-    clean(cells.width, cell, cells.pos, state, rings, limit2, drop, residuals, after)
+    clean(cells.width, cell, cells.pos, state, rings, limit2, drop, residuals, room_for_index(len(state)), after)
     local_roughness(cells.width, cells.height, after, residuals, ROUGH_REACH, round(ROUGH_MOST * MM), rough)
     return _label(cloud, cells, after, rough, params)
 
@@ -135,7 +165,7 @@ def _grow(cells: Cells, params: RobustParams) -> npt.NDArray[np.uint8]:
     """Grow the references over the low points in synchronous passes (step 7); return the new state."""
     limit = round(params.search_radius * MM)
     state, after = cells.state, np.empty_like(cells.state)
-    looked, news = np.empty(len(state), np.uint8), np.empty(len(state), np.int32)
+    looked, news, index = np.empty(len(state), np.uint16), np.empty(len(state), np.int32), room_for_index(len(state))
     for number in range(params.passes):
         changed = grow(
             cells.width,
@@ -155,8 +185,12 @@ def _grow(cells: Cells, params: RobustParams) -> npt.NDArray[np.uint8]:
             0.0,
             1,
             number == 0,
+            cells.pos,
+            state,
+            1,
             looked,
             news,
+            index,
             after,
         )
         if not changed:
@@ -187,7 +221,7 @@ def _label(
             cell,
         )
         width, cell, parts, limit = 2 * width, cell // 2, 2, limit // 2
-        state = _grow_fine(width, cell, pos, state, rough, params)
+        state = _grow_fine(cells, known, pos, state, rough, params)
     ground, unproven = np.empty(cloud.n_core, np.bool_), np.empty(cloud.n_core, np.bool_)
     label(
         cloud.x,
@@ -212,6 +246,7 @@ def _label(
         params.roughness,
         params.label_spread,
         params.label_slope,
+        room_for_index(len(state)),
         ground,
         unproven,
     )
@@ -219,8 +254,8 @@ def _label(
 
 
 def _grow_fine(
-    width: int,
-    cell: int,
+    coarse: Cells,
+    known: npt.NDArray[np.uint8],
     pos: npt.NDArray[np.int32],
     state: npt.NDArray[np.uint8],
     rough: npt.NDArray[np.int32],
@@ -228,15 +263,15 @@ def _grow_fine(
 ) -> npt.NDArray[np.uint8]:
     """Growth over the finer cells with a tolerance that follows the roughness (step 10)."""
     limit = round(params.search_radius * MM) // 2
-    rings, after = -(-limit // cell), np.empty_like(state)
-    looked, news = np.empty(len(state), np.uint8), np.empty(len(state), np.int32)
+    width, cell, after = 2 * coarse.width, coarse.cell // 2, np.empty_like(state)
+    looked, news, index = np.empty(len(state), np.uint16), np.empty(len(state), np.int32), room_for_index(len(state))
     for number in range(params.fine_passes):
         grow(
             width,
             cell,
             pos,
             state,
-            rings,
+            -(-limit // (coarse.cell if number == 0 else cell)),
             limit * limit,
             params.fine_base,
             params.fine_spread,
@@ -249,8 +284,12 @@ def _grow_fine(
             ROUGH_MOST,
             2,
             number == 0,
+            coarse.pos if number == 0 else pos,
+            known if number == 0 else state,
+            2 if number == 0 else 1,
             looked,
             news,
+            index,
             after,
         )
         state, after = after, state

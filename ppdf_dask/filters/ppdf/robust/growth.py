@@ -9,22 +9,25 @@ from numba import njit
 
 from ppdf_dask.filters.ppdf.compiled import leaf
 from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, ROOF, UNPROVEN
-from ppdf_dask.filters.ppdf.robust.surface import height_above, nearest
+from ppdf_dask.filters.ppdf.robust.surface import count_within, height_above, index_references, nearest, reach
 
 NOT_KNOWN = np.int32(-(2**31))
 """A residual or roughness that does not exist or is not proven."""
 
 
 @leaf
-def _nearest_others(
-    state: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, rings: Any, limit2: Any, found: Any
+def _look_around(
+    state: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, rings: Any, limit2: Any, index: Any, found: Any
 ) -> Any:
-    """`nearest`, but blind to cell `k` itself."""
-    own = state[k]
-    state[k] = 0
-    unknown = nearest(state, pos, width, cell, k, x, y, rings, limit2, found)
-    state[k] = own
-    return unknown
+    """Find the nearest references around a low point in cell `k`, itself left out; return the rings that decide them.
+
+    The second value tells whether an unproven cell lies within, other than by the low point itself.
+    """
+    right, left, open_ = index
+    nearest(right, left, pos, width, cell, k, x, y, limit2, found)
+    ring = reach(found, x - k % width * cell, y - k // width * cell, cell, rings)
+    itself = (state[k] & UNPROVEN) != 0 and pos[k, 0] == x and pos[k, 1] == y
+    return ring, count_within(open_, width, k, ring) > itself
 
 
 @njit(nogil=True, cache=True)
@@ -46,18 +49,27 @@ def grow(
     rough_most: Any,
     parts: Any,
     first: Any,
+    seek_pos: Any,
+    seek_state: Any,
+    fold: Any,
     looked: Any,
     news: Any,
+    index: Any,
     after: Any,
 ) -> Any:
     """Do one synchronous pass: `after` gets the new state; return how many states changed.
 
+    References are sought among `seek_state`, `rings` cells around: those of this grid, or of the coarser one with
+    `fold` x `fold` cells in one, where only its low points are references yet and lie closer together, in cells.
+
     After the first pass a cell is tested again only where something changed within the rings (`looked`) its search
     visited; `news` is the summed-area table of the changes of the pass before, and of this one in the end. `rough`
     holds the roughness (mm) of the coarse cells, `parts` x `parts` of these cells make one of them; an empty array
-    stands for none.
+    stands for none; `index` is room for `index_references`.
     """
-    found = np.empty(9, np.int64)
+    seek_width = width // fold
+    index_references(seek_width, seek_state, index[0], index[1], index[2])
+    found = np.empty(8, np.int64)
     soft = 0.1 * (cell * 1e-3) ** 2
     changed = 0
     for k in range(len(state)):
@@ -65,17 +77,15 @@ def grow(
         after[k] = s
         if not s & LOW or s & ROOF or s & (REF | UNPROVEN) == REF:
             continue
-        if not first:
-            e = looked[k]
-            a = k - (e + 1) * width - e - 1
-            b = k + e * width - e - 1
-            wide = 2 * e + 1
-            if news[b + wide] - news[a + wide] == news[b] - news[a]:
-                continue
+        if not first and count_within(news, width, k, np.int64(looked[k])) == 0:
+            continue
         x, y, z = np.int64(pos[k, 0]), np.int64(pos[k, 1]), np.int64(pos[k, 2])
-        unknown = _nearest_others(state, pos, width, cell, k, x, y, rings, limit2, found)
-        looked[k] = found[4]
-        n, r, slope, d, step = height_above(pos, x, y, z, found, soft)
+        q = k // width // fold * seek_width + k % width // fold
+        ring, unknown = _look_around(
+            seek_state, seek_pos, seek_width, cell * fold, q, x, y, rings, limit2, index, found
+        )
+        looked[k] = fold * ring + fold - 1
+        n, r, slope, d, step = height_above(seek_pos, x, y, z, found, soft)
         least = most = 0.0
         if len(rough) > 0:
             here = rough[k // width // parts * (width // parts) + k % width // parts]
@@ -106,14 +116,24 @@ def grow(
 
 @njit(nogil=True, cache=True)
 def clean(
-    width: Any, cell: Any, pos: Any, state: Any, rings: Any, limit2: Any, drop: Any, residuals: Any, after: Any
+    width: Any,
+    cell: Any,
+    pos: Any,
+    state: Any,
+    rings: Any,
+    limit2: Any,
+    drop: Any,
+    residuals: Any,
+    index: Any,
+    after: Any,
 ) -> None:
     """Re-test every reference without itself.
 
     `after` gets the new state, `residuals` the heights (mm) of those that stay. Without `drop` only the residuals are
     taken.
     """
-    found = np.empty(9, np.int64)
+    index_references(width, state, index[0], index[1], index[2])
+    found = np.empty(8, np.int64)
     soft = 0.1 * (cell * 1e-3) ** 2
     for k in range(len(state)):
         s = state[k]
@@ -122,7 +142,7 @@ def clean(
         if not s & REF:
             continue
         x, y, z = np.int64(pos[k, 0]), np.int64(pos[k, 1]), np.int64(pos[k, 2])
-        unknown = _nearest_others(state, pos, width, cell, k, x, y, rings, limit2, found)
+        _ring, unknown = _look_around(state, pos, width, cell, k, x, y, rings, limit2, index, found)
         n, r, slope, d, _step = height_above(pos, x, y, z, found, soft)
         if n >= 3:
             if drop and not s & FIXED and r > 0.3 + (0.2 + 1.2 * slope) * d:

@@ -9,7 +9,7 @@ from numba import njit
 
 from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
 from ppdf_dask.filters.ppdf.robust.growth import NOT_KNOWN
-from ppdf_dask.filters.ppdf.robust.surface import height_above, nearest
+from ppdf_dask.filters.ppdf.robust.surface import count_within, height_above, index_references, nearest, reach
 
 
 @njit(nogil=True, cache=True)
@@ -36,15 +36,19 @@ def label(
     rough_factor: Any,
     spread: Any,
     slope_factor: Any,
+    index: Any,
     ground: Any,
     unproven: Any,
 ) -> None:
     """Set `ground` and `unproven` of the core points.
 
     `of_point`, `floor`, `known` (their states) and `rough` speak of the coarse cells; `width`, `cell`, `pos` and
-    `state` of the fine ones, `parts` x `parts` to a coarse one.
+    `state` of the fine ones, `parts` x `parts` to a coarse one; `index` is room for `index_references`.
     """
-    found = np.empty(9, np.int64)
+    right, left, open_ = index
+    index_references(width, state, right, left, open_)
+    all_known = open_[len(open_) - 1] == 0
+    found = np.empty(8, np.int64)
     soft = 0.1 * (cell * 1e-3) ** 2
     for i in range(n_core):
         ground[i] = False
@@ -68,7 +72,11 @@ def label(
             continue
         if zi - pos[k, 2] >= 5000:
             continue
-        unknown = nearest(state, pos, width, cell, k, xi, yi, rings, limit2, found)
+        nearest(right, left, pos, width, cell, k, xi, yi, limit2, found)
+        unknown = False
+        if not all_known:
+            ring = reach(found, xi - k % width * cell, yi - k // width * cell, cell, rings)
+            unknown = count_within(open_, width, k, ring) > 0
         n, r, slope, d, _step = height_above(pos, xi, yi, zi, found, soft)
         if n > 0 and r > -(3.0 + slope * d):
             rise = (spread + slope_factor * slope) * d

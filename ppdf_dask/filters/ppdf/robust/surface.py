@@ -5,59 +5,160 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from numba import njit
 
 from ppdf_dask.filters.ppdf.compiled import leaf
 from ppdf_dask.filters.ppdf.robust.cells import REF, UNPROVEN
 
+NONE = 60_000
+"""Cells: no reference in this direction; farther than any search."""
+
+
+def room_for_index(cells: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16], npt.NDArray[np.int32]]:
+    """Return the arrays that `index_references` fills: 8 bytes per cell."""
+    return np.empty(cells, np.uint16), np.empty(cells, np.uint16), np.empty(cells, np.int32)
+
+
+@njit(nogil=True, cache=True)
+def index_references(width: Any, state: Any, right: Any, left: Any, unproven: Any) -> None:
+    """Index a grid for `nearest` and `count_within`.
+
+    `right` and `left` (uint16) get the number of cells to the next reference of the row, the cell itself included,
+    or `NONE`; `unproven` (int32) the summed-area table of unproven cells.
+    """
+    for row in range(len(state) // width):
+        start = row * width
+        gap = NONE
+        for k in range(start + width - 1, start - 1, -1):
+            gap = 0 if state[k] & REF else min(gap + 1, NONE)
+            right[k] = gap
+        gap = NONE
+        total = 0
+        for k in range(start, start + width):
+            gap = 0 if state[k] & REF else min(gap + 1, NONE)
+            left[k] = gap
+            total += (state[k] & UNPROVEN) != 0
+            unproven[k] = total + (unproven[k - width] if row > 0 else 0)
+
+
+@leaf
+def count_within(table: Any, width: Any, k: Any, ring: Any) -> Any:
+    """Return the sum over the square of `ring` cells around cell `k` from a summed-area table."""
+    a = k - (ring + 1) * width - ring - 1
+    b = k + ring * width - ring - 1
+    wide = 2 * ring + 1
+    return table[b + wide] - table[a + wide] - table[b] + table[a]
+
+
+@leaf
+def _nearest_in(
+    gap: Any,
+    pos: Any,
+    width: Any,
+    cell: Any,
+    k: Any,
+    x: Any,
+    y: Any,
+    right: Any,
+    up: Any,
+    found: Any,
+    q: Any,
+) -> None:
+    """Look in one quadrant for a nearer reference than `found` has; `right` and `up` are 1 or -1, `gap` the index.
+
+    Row by row outwards, from reference to reference, as long as a row or a column can still hold a nearer one.
+    """
+    fx = x - k % width * cell
+    fy = y - k // width * cell
+    wide = cell - fx if right > 0 else fx + 1
+    high = cell - fy if up > 0 else fy + 1
+    best, which = found[4 + q], found[q]
+    row, far2 = k, np.int64(0)
+    for r in range(NONE):
+        o = np.int64(gap[row])
+        u2 = np.int64(0) if o == 0 else (wide + (o - 1) * cell) ** 2
+        while u2 + far2 <= best:
+            j = row + o * right
+            u = (np.int64(pos[j, 0]) - x) * right
+            v = (np.int64(pos[j, 1]) - y) * up
+            d2 = u * u + v * v
+            inside = (u >= 0) & (v >= 0) & ((u if right == up else v) > 0)
+            if inside and (d2 < best or (d2 == best and (which < 0 or before(pos, j, which)))):
+                best = d2
+                which = j
+            o += 1 + np.int64(gap[j + right])
+            u2 = (wide + (o - 1) * cell) ** 2
+        row += width * up
+        far2 = (high + r * cell) ** 2
+        if far2 > best:
+            break
+    found[q] = which
+    found[4 + q] = best
+
 
 @leaf
 def nearest(
-    state: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, rings: Any, limit2: Any, found: Any
-) -> Any:
-    """Find the nearest reference in each quadrant around (`x`, `y`) of cell `k`; tell if unproven cells were seen.
+    right: Any, left: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, limit2: Any, found: Any
+) -> None:
+    """Find the nearest reference in each quadrant around (`x`, `y`) of cell `k`, none at that very place.
 
-    `found` (int64, 9) gets the four cells or -1, the last ring visited, and the squared distances. The quadrants are
-    half-open, so that a point on an axis belongs to one of them, and numbered right + 2 up: no branch decides.
+    `found` (int64, 8) gets the four cells or -1, and the four squared distances or `limit2`. The quadrants are
+    half-open, so that a point on an axis belongs to one of them, and numbered right + 2 up. First the cells around,
+    where it mostly is; then quadrant by quadrant what they leave open.
     """
     fx = x - k % width * cell
     fy = y - k // width * cell
     for q in range(4):
         found[q] = -1
-        found[5 + q] = np.int64(1) << 60
-    seen = np.uint8(0)
-    for ring in range(rings + 1):
-        found[4] = ring
-        for dr in range(-ring, ring + 1):
-            base = k + dr * width
-            step = 1 if abs(dr) == ring or ring == 0 else 2 * ring
-            for j in range(base - ring, base + ring + 1, step):
-                s = state[j]
-                seen |= s
-                if not s & REF:
-                    continue
-                dx = np.int64(pos[j, 0]) - x
-                dy = np.int64(pos[j, 1]) - y
-                d2 = dx * dx + dy * dy
-                right = (dx > 0) | ((dx == 0) & (dy < 0))
-                up = (dy > 0) | ((dy == 0) & (dx > 0))
-                quadrant = np.int64(right) + 2 * np.int64(up)
-                if d2 > found[5 + quadrant] or d2 > limit2 or d2 == 0:
-                    continue
-                if d2 < found[5 + quadrant] or before(pos, j, found[quadrant]):
-                    found[5 + quadrant] = d2
-                    found[quadrant] = j
-        right_side = (ring + 1) * cell - fx
-        left_side = ring * cell + fx
+        found[4 + q] = limit2
+    for dr in range(-1, 2):
+        for j in range(k + dr * width - 1, k + dr * width + 2):
+            if right[j] != 0:
+                continue
+            dx = np.int64(pos[j, 0]) - x
+            dy = np.int64(pos[j, 1]) - y
+            d2 = dx * dx + dy * dy
+            is_right = (dx > 0) | ((dx == 0) & (dy < 0))
+            is_up = (dy > 0) | ((dy == 0) & (dx > 0))
+            quadrant = np.int64(is_right) + 2 * np.int64(is_up)
+            if d2 > found[4 + quadrant] or d2 == 0:
+                continue
+            if d2 < found[4 + quadrant] or found[quadrant] < 0 or before(pos, j, found[quadrant]):
+                found[4 + quadrant] = d2
+                found[quadrant] = j
+    if found[4] >= (cell + min(fx, fy)) ** 2:
+        _nearest_in(left, pos, width, cell, k, x, y, -1, -1, found, 0)
+    if found[5] >= min(2 * cell - fx, cell + fy) ** 2:
+        _nearest_in(right, pos, width, cell, k, x, y, 1, -1, found, 1)
+    if found[6] >= min(cell + fx, 2 * cell - fy) ** 2:
+        _nearest_in(left, pos, width, cell, k, x, y, -1, 1, found, 2)
+    if found[7] >= (2 * cell - max(fx, fy)) ** 2:
+        _nearest_in(right, pos, width, cell, k, x, y, 1, 1, found, 3)
+
+
+@leaf
+def reach(found: Any, fx: Any, fy: Any, cell: Any, rings: Any) -> Any:
+    """Return how many rings of cells decide what `nearest` found: beyond them nothing could be nearer.
+
+    `fx`, `fy` is the place within its cell; `rings` where a quadrant is empty.
+    """
+    for q in range(4):
+        if found[q] < 0:
+            return rings
+    for ring in range(rings):
+        right = (ring + 1) * cell - fx
+        left = ring * cell + fx
         top = (ring + 1) * cell - fy
         bottom = ring * cell + fy
         if (
-            found[8] < min(right_side, top) ** 2
-            and found[7] < min(left_side, top) ** 2
-            and found[5] < min(left_side, bottom) ** 2
-            and found[6] < min(right_side, bottom) ** 2
+            found[7] < min(right, top) ** 2
+            and found[6] < min(left, top) ** 2
+            and found[4] < min(left, bottom) ** 2
+            and found[5] < min(right, bottom) ** 2
         ):
-            break
-    return (seen & UNPROVEN) != 0
+            return ring
+    return rings
 
 
 @leaf
