@@ -36,5 +36,5 @@ def leaf(function: F) -> F:
     >>> _growth_kernels._slot(3, -4, False)  # the fourth quadrant
     3
     """
-    compiled: F = _njit(nogil=True, cache=True, _nrt=False)(function)
+    compiled: F = _njit(nogil=True, cache=True, _nrt=False, error_model="numpy")(function)
     return compiled

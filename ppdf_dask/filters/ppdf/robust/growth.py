@@ -24,8 +24,9 @@ def _look_around(
     The second value tells whether an unproven cell lies within, other than by the low point itself.
     """
     right, left, open_ = index
-    nearest(right, left, pos, width, cell, k, x, y, limit2, found)
-    ring = reach(found, x - k % width * cell, y - k // width * cell, cell, rings)
+    fx, fy = x % cell, y % cell
+    nearest(right, left, pos, width, cell, k, x, y, fx, fy, limit2, found)
+    ring = reach(found, fx, fy, cell, rings)
     itself = (state[k] & UNPROVEN) != 0 and pos[k, 0] == x and pos[k, 1] == y
     return ring, count_within(open_, width, k, ring) > itself
 

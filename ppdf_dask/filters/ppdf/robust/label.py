@@ -72,10 +72,11 @@ def label(
             continue
         if zi - pos[k, 2] >= 5000:
             continue
-        nearest(right, left, pos, width, cell, k, xi, yi, limit2, found)
+        fx, fy = xi % cell, yi % cell
+        nearest(right, left, pos, width, cell, k, xi, yi, fx, fy, limit2, found)
         unknown = False
         if not all_known:
-            ring = reach(found, xi - k % width * cell, yi - k // width * cell, cell, rings)
+            ring = reach(found, fx, fy, cell, rings)
             unknown = count_within(open_, width, k, ring) > 0
         n, r, slope, d, _step = height_above(pos, xi, yi, zi, found, soft)
         if n > 0 and r > -(3.0 + slope * d):

@@ -60,6 +60,8 @@ def _nearest_in(
     k: Any,
     x: Any,
     y: Any,
+    fx: Any,
+    fy: Any,
     right: Any,
     up: Any,
     found: Any,
@@ -69,8 +71,6 @@ def _nearest_in(
 
     Row by row outwards, from reference to reference, as long as a row or a column can still hold a nearer one.
     """
-    fx = x - k % width * cell
-    fy = y - k // width * cell
     wide = cell - fx if right > 0 else fx + 1
     high = cell - fy if up > 0 else fy + 1
     best, which = found[4 + q], found[q]
@@ -99,16 +99,27 @@ def _nearest_in(
 
 @leaf
 def nearest(
-    right: Any, left: Any, pos: Any, width: Any, cell: Any, k: Any, x: Any, y: Any, limit2: Any, found: Any
+    right: Any,
+    left: Any,
+    pos: Any,
+    width: Any,
+    cell: Any,
+    k: Any,
+    x: Any,
+    y: Any,
+    fx: Any,
+    fy: Any,
+    limit2: Any,
+    found: Any,
 ) -> None:
-    """Find the nearest reference in each quadrant around (`x`, `y`) of cell `k`, none at that very place.
+    """Find the nearest reference in each quadrant around (`x`, `y`), none at that very place.
+
+    The place lies `fx`, `fy` within cell `k`.
 
     `found` (int64, 8) gets the four cells or -1, and the four squared distances or `limit2`. The quadrants are
     half-open, so that a point on an axis belongs to one of them, and numbered right + 2 up. First the cells around,
     where it mostly is; then quadrant by quadrant what they leave open.
     """
-    fx = x - k % width * cell
-    fy = y - k // width * cell
     for q in range(4):
         found[q] = -1
         found[4 + q] = limit2
@@ -128,13 +139,13 @@ def nearest(
                 found[4 + quadrant] = d2
                 found[quadrant] = j
     if found[4] >= (cell + min(fx, fy)) ** 2:
-        _nearest_in(left, pos, width, cell, k, x, y, -1, -1, found, 0)
+        _nearest_in(left, pos, width, cell, k, x, y, fx, fy, -1, -1, found, 0)
     if found[5] >= min(2 * cell - fx, cell + fy) ** 2:
-        _nearest_in(right, pos, width, cell, k, x, y, 1, -1, found, 1)
+        _nearest_in(right, pos, width, cell, k, x, y, fx, fy, 1, -1, found, 1)
     if found[6] >= min(cell + fx, 2 * cell - fy) ** 2:
-        _nearest_in(left, pos, width, cell, k, x, y, -1, 1, found, 2)
+        _nearest_in(left, pos, width, cell, k, x, y, fx, fy, -1, 1, found, 2)
     if found[7] >= (2 * cell - max(fx, fy)) ** 2:
-        _nearest_in(right, pos, width, cell, k, x, y, 1, 1, found, 3)
+        _nearest_in(right, pos, width, cell, k, x, y, fx, fy, 1, 1, found, 3)
 
 
 @leaf
