@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ppdf_dask import filters
 from ppdf_dask.errors import ParameterError, SurveyError, TileError
@@ -13,10 +14,13 @@ from ppdf_dask.filters.cloud import cloud_from_grid, density
 from ppdf_dask.grid import ChunkGrid
 from ppdf_dask.merge import rewrite
 from ppdf_dask.params import RunParams
-from ppdf_dask.reader import Batch
+from ppdf_dask.reader import BATCH, Labels, at_once, header_of
+from ppdf_dask.relabel import can_relabel, whole_chunks
 from ppdf_dask.survey import Survey
 from ppdf_dask.tiler import TileJob
 from ppdf_dask.tiles import shown
+
+Bools = npt.NDArray[np.bool_]
 
 
 def classify_tile(survey: Survey, target: str | Path, params: RunParams | None = None) -> dict[str, Any]:
@@ -50,16 +54,24 @@ def classify_tile(survey: Survey, target: str | Path, params: RunParams | None =
         raise SurveyError(f"{target} is the input itself; give another name for the output")
     params = params or RunParams()
     job = TileJob("s_000000", tile, survey.unit_xy, survey.unit_z, params, ChunkGrid.from_metres(1000.0), 0)
-    ground = _ground(job)
-    record = rewrite(job, target, _Cursor(ground).take)
+    header = header_of(tile)
+    # A layered file's new classes need no more than its labels: it is decoded once.
+    once = target.suffix != ".las" and can_relabel(header, at_once(header))
+    ground, labels = _ground(job, whole_chunks(header, at_once(header)) if once else BATCH)
+    cursor = _Cursor(ground)
+    kept = ((part, cursor.take(part)) for part in labels) if once else None
+    record = rewrite(job, target, lambda batch: cursor.take(batch.labels), kept)
     return record | {"ground": int(ground.sum())}
 
 
-def _ground(job: TileJob) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    parts = [
-        np.stack([values[batch.eligible] for values in (batch.x, batch.y, batch.z, batch.fixed.astype(np.int64))])
-        for batch in job.batches()
-    ]
+def _ground(job: TileJob, size: int) -> tuple[Bools, list[Labels]]:
+    """Decode a tile, `size` points at a time; return the mask of its eligible points, and the labels of all."""
+    parts, labels = [], []
+    for batch in job.batches(size):
+        seen = batch.eligible
+        parts.append(np.stack([batch.x[seen], batch.y[seen], batch.z[seen], batch.fixed[seen].astype(np.int64)]))
+        # Copies, for a view would keep the whole records alive.
+        labels.append(Labels(batch.returns.copy(), batch.flags.copy(), batch.classification, seen))
     points = np.concatenate(parts, axis=1) if parts else np.empty((4, 0), np.int64)
     fixed = points[3].astype(np.bool_) if job.params.classes.mode == "refine" else None
     try:
@@ -68,18 +80,18 @@ def _ground(job: TileJob) -> np.ndarray[Any, np.dtype[np.bool_]]:
         raise TileError(f"{shown(job.tile.path)}: {error}") from error
     chosen = filters.of(job.params.filter)
     found = chosen.classify(cloud, chosen.resolve(job.params.filter, density(cloud))).ground
-    return found if cloud.fixed is None else found | cloud.fixed
+    return (found if cloud.fixed is None else found | cloud.fixed), labels
 
 
 class _Cursor:
     """Hands out a mask of eligible points batch by batch."""
 
-    def __init__(self, ground: np.ndarray[Any, np.dtype[np.bool_]]) -> None:
+    def __init__(self, ground: Bools) -> None:
         self._ground, self._used = ground, 0
 
-    def take(self, batch: Batch) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        found = np.zeros(batch.n, np.bool_)
-        count = int(batch.eligible.sum())
-        found[batch.eligible] = self._ground[self._used : self._used + count]
+    def take(self, labels: Labels) -> Bools:
+        found = np.zeros(labels.n, np.bool_)
+        count = int(labels.eligible.sum())
+        found[labels.eligible] = self._ground[self._used : self._used + count]
         self._used += count
         return found
