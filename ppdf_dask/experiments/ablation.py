@@ -22,6 +22,7 @@ ROBUST_CHANGES: dict[str, dict[str, Any]] = {
     "no reliability test (Eq. 2)": {"division_distance": 1000.0},
     "no share of inliers asked for": {"inlier_share": 0.0},
     "small patches are believed": {"smallest_patch": 0},
+    "gentle borders count in full": {"border_gentle": 1.0},
     "tolerance blind to roughness": {"roughness": 0.0},
     "tolerance blind to slope": {"label_slope": 0.0},
     "search up to 10 m": {"search_radius": 10.0},

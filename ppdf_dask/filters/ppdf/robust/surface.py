@@ -62,16 +62,17 @@ def _nearest_in(
     y: Any,
     fx: Any,
     fy: Any,
-    right: Any,
+    along: Any,
     up: Any,
     found: Any,
     q: Any,
 ) -> None:
-    """Look in one quadrant for a nearer reference than `found` has; `right` and `up` are 1 or -1, `gap` the index.
+    """Look in one quadrant for a nearer reference than `found` has.
 
-    Row by row outwards, from reference to reference, as long as a row or a column can still hold a nearer one.
+    `along` and `up` are 1 or -1, `gap` is the index that way. Row by row outwards, from reference to reference, as
+    long as a row or a column can still hold a nearer one.
     """
-    wide = cell - fx if right > 0 else fx + 1
+    wide = cell - fx if along > 0 else fx + 1
     high = cell - fy if up > 0 else fy + 1
     best, which = found[4 + q], found[q]
     row, far2 = k, np.int64(0)
@@ -79,15 +80,15 @@ def _nearest_in(
         o = np.int64(gap[row])
         u2 = np.int64(0) if o == 0 else (wide + (o - 1) * cell) ** 2
         while u2 + far2 <= best:
-            j = row + o * right
-            u = (np.int64(pos[j, 0]) - x) * right
+            j = row + o * along
+            u = (np.int64(pos[j, 0]) - x) * along
             v = (np.int64(pos[j, 1]) - y) * up
             d2 = u * u + v * v
-            inside = (u >= 0) & (v >= 0) & ((u if right == up else v) > 0)
+            inside = (u >= 0) & (v >= 0) & ((u if along == up else v) > 0)
             if inside and (d2 < best or (d2 == best and (which < 0 or before(pos, j, which)))):
                 best = d2
                 which = j
-            o += 1 + np.int64(gap[j + right])
+            o += 1 + np.int64(gap[j + along])
             u2 = (wide + (o - 1) * cell) ** 2
         row += width * up
         far2 = (high + r * cell) ** 2
@@ -114,11 +115,9 @@ def nearest(
 ) -> None:
     """Find the nearest reference in each quadrant around (`x`, `y`), none at that very place.
 
-    The place lies `fx`, `fy` within cell `k`.
-
-    `found` (int64, 8) gets the four cells or -1, and the four squared distances or `limit2`. The quadrants are
-    half-open, so that a point on an axis belongs to one of them, and numbered right + 2 up. First the cells around,
-    where it mostly is; then quadrant by quadrant what they leave open.
+    The place lies `fx`, `fy` within cell `k`. `found` (int64, 8) gets the four cells or -1, and the four squared
+    distances or `limit2`. The quadrants are half-open, so that a point on an axis belongs to one of them, and numbered
+    right + 2 up. First the cells around, where it mostly is; then quadrant by quadrant what they leave open.
     """
     for q in range(4):
         found[q] = -1
@@ -138,14 +137,12 @@ def nearest(
             if d2 < found[4 + quadrant] or found[quadrant] < 0 or before(pos, j, found[quadrant]):
                 found[4 + quadrant] = d2
                 found[quadrant] = j
-    if found[4] >= (cell + min(fx, fy)) ** 2:
-        _nearest_in(left, pos, width, cell, k, x, y, fx, fy, -1, -1, found, 0)
-    if found[5] >= min(2 * cell - fx, cell + fy) ** 2:
-        _nearest_in(right, pos, width, cell, k, x, y, fx, fy, 1, -1, found, 1)
-    if found[6] >= min(cell + fx, 2 * cell - fy) ** 2:
-        _nearest_in(left, pos, width, cell, k, x, y, fx, fy, -1, 1, found, 2)
-    if found[7] >= (2 * cell - max(fx, fy)) ** 2:
-        _nearest_in(right, pos, width, cell, k, x, y, fx, fy, 1, 1, found, 3)
+    for q in range(4):
+        to_side = 2 * cell - fx if q & 1 else cell + fx
+        to_end = 2 * cell - fy if q & 2 else cell + fy
+        if found[4 + q] >= min(to_side, to_end) ** 2:
+            way, along = (right, 1) if q & 1 else (left, -1)
+            _nearest_in(way, pos, width, cell, k, x, y, fx, fy, along, 1 if q & 2 else -1, found, q)
 
 
 @leaf
