@@ -74,7 +74,8 @@ class Surroundings:
         waveform = _waveform(raw, header)
         tail = list(kept)
         if waveform and not any(begin <= waveform < end for begin, end in kept):
-            tail = sorted([*kept, (waveform, _record_end(file, waveform, header.size))])
+            end = min([header.size, *(begin for begin, _ in kept if begin > waveform)])
+            tail = sorted([*kept, (waveform, end)])
         first = kept[0][0] if kept else 0
         return cls(raw[:size], tuple(vlrs), laszip, raw[position:], tuple(tail), len(kept), first, waveform)
 
@@ -161,14 +162,6 @@ def _waveform(raw: bytes, header: Header) -> int:
         return 0
     (position,) = struct.unpack_from("<Q", raw, _WAVEFORM)
     return position if header.end_of_points <= position < header.size else 0
-
-
-def _record_end(file: BinaryIO, position: int, size: int) -> int:
-    """Return the end of the waveform record, which has the head of an extended one; the file's end if it lies."""
-    file.seek(position)
-    raw = file.read(_EVLR.size)
-    length = _EVLR.unpack(raw)[3] if len(raw) == _EVLR.size else size
-    return min(size, position + _EVLR.size + length)
 
 
 def _blocks(file: BinaryIO, begin: int, end: int) -> Iterator[bytes]:

@@ -8,6 +8,7 @@ gets its own name. Of layered files (formats 6 to 8) one layer is made anew and 
 from __future__ import annotations
 
 import os
+import secrets
 import zlib
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -78,12 +79,16 @@ def write_tile(store: RunStore, job: MergeJob) -> dict[str, Any]:
     masks = _Masks(store, job.tile, job.made_by)
     kept = kept_labels(store, job.tile.source, job.labels, job.cut_by)
     labelled = ((labels, masks.of(labels.eligible, groups)) for labels, groups in kept)
-    record = rewrite(job.tile, Path(job.target), masks.ground, labelled if job.labels else None)
-    masks.check_used_up()
-    return record
+    return rewrite(job.tile, Path(job.target), masks.ground, labelled if job.labels else None, masks.check_used_up)
 
 
-def rewrite(job: TileJob, target: Path, ground_of: GroundOf, kept: Kept | None = None) -> dict[str, Any]:
+def rewrite(
+    job: TileJob,
+    target: Path,
+    ground_of: GroundOf,
+    kept: Kept | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
     """Copy a file with new classes.
 
     Parameters
@@ -97,6 +102,8 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf, kept: Kept | None =
     kept : iterable, optional
         Labels of all points, in batches of whole chunks (`whole_chunks`), and the mask of each batch; for files that
         `can_relabel`, which need not be decoded again then.
+    check : callable, optional
+        Called when all is written, before the file gets its name; what it raises keeps the name away.
 
     Returns
     -------
@@ -109,8 +116,8 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf, kept: Kept | None =
         The source is damaged or changed, or the written file does not read back as it was meant.
     """
     check_writable(job.params.classes, job.tile.point_format, shown(job.tile.path))
-    # Short, for the target's own name may be as long as names can be.
-    part = target.with_name(f".{zlib.crc32(target.name.encode()):08x}.{os.getpid()}.part")
+    # Short, for the target's own name may be as long as names can be; at random, for containers share process numbers.
+    part = target.with_name(f".{zlib.crc32(target.name.encode()):08x}.{secrets.randbits(32)}.part")
     header, compress = header_of(job.tile), target.suffix != ".las"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -119,9 +126,10 @@ def rewrite(job: TileJob, target: Path, ground_of: GroundOf, kept: Kept | None =
         else:
             meant = _copy(job, header, part, ground_of, compress=compress)
         job.tile.check_unchanged()
+        check()
         crc = crc32_of(part)
         os.replace(part, target)
-    except OSError as error:
+    except (OSError, lazrs.LazrsError) as error:  # the encoder's own word for a full disk; decoding has sentences
         raise TileError(f"{shown(job.tile.path)} could not be written to {target}: {error}") from error
     finally:
         with suppress(FileNotFoundError, NotADirectoryError):

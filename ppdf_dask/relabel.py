@@ -39,6 +39,9 @@ _LAYERS = 9
 _EVLR_START = 235
 """Byte of the header that says where the EVLRs begin (LAS 1.4 R15, table 3)."""
 
+_LARGE = 16 << 20
+"""Bytes before or behind the points that are copied at once; files with more are copied block by block."""
+
 _UNTIDY = {"chunk-table", "trailing"}
 """What a header is warned of that a copy by bytes would hand on."""
 
@@ -58,7 +61,8 @@ def can_relabel(header: Header, most_points: int) -> bool:
         return False
     tidy = not _UNTIDY.intersection(code for code, _ in header.warnings)
     apart = header.evlr_count == 0 or header.evlrs[0] > laszip.table
-    usual = header.point_format in _LAYERED and not header.copc and not header.waveforms
+    small = max(header.offset_to_points, header.evlrs[1] - header.evlrs[0]) <= _LARGE
+    usual = small and header.point_format in _LAYERED and not header.copc and not header.waveforms
     return usual and tidy and apart and header.point_count > 0 and laszip.chunk_size <= most_points
 
 
@@ -119,6 +123,8 @@ def differs(source: str, header: Header, target: Path) -> str:
     str
         What differs; empty when only classes may.
     """
+    import lazrs
+
     try:
         new_header = read_header(str(target))
     except Reject as reject:
@@ -127,11 +133,17 @@ def differs(source: str, header: Header, target: Path) -> str:
         heads = (old.read(header.offset_to_points), new.read(new_header.offset_to_points))
         if _without(heads[0], _EVLR_START, 8) != _without(heads[1], _EVLR_START, 8):
             return "its header differs"
+        sizes = []
         for ours, theirs in zip_longest(_chunks(new, new_header, str(target)), _chunks(old, header, source)):
             if ours is None or theirs is None:
                 return "its number of chunks differs"
+            sizes.append(ours.end - ours.position)
             if _all_but_classes(new, ours) != _all_but_classes(old, theirs):
                 return f"its chunk at byte {ours.position} differs"
+        assert header.laszip is not None
+        new.seek(header.offset_to_points)
+        if [size for _, size in lazrs.read_chunk_table(new, lazrs.LazVlr(header.laszip.record))] != sizes:
+            return "its chunk table differs"
         old.seek(header.evlrs[0])
         new.seek(new_header.evlrs[0])
         lengths = [h.evlrs[1] - h.evlrs[0] for h in (header, new_header)]

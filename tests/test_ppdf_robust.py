@@ -39,12 +39,13 @@ def scene(seed, n=2500, side=110.0, snap=1):
     return mm + np.array([500_000_000, 5_400_000_000, 0]) // 16_000 * 16_000 - np.array([40_000, 3_000, 0])
 
 
-def crop(points, rect):
+def crop(points, rect, fixed=None):
     x, y, _z = points.T
     inside = np.flatnonzero((x >= rect.x0) & (x < rect.x1) & (y >= rect.y0) & (y < rect.y1))
     base = np.array([rect.x0, rect.y0, 0])
     px, py, pz = (points[inside] - base).astype(np.int32).T
-    return inside, Cloud(px, py, pz, (rect.x0, rect.y0), len(inside), rect)
+    pinned = None if fixed is None else fixed[inside]
+    return inside, Cloud(px, py, pz, (rect.x0, rect.y0), len(inside), rect, pinned)
 
 
 seeds = st.integers(0, 2**32 - 1)
@@ -70,16 +71,18 @@ def test_every_step_does_what_the_plain_oracle_does(seed, snap, params, steps):
     fraction=st.tuples(*[st.floats(0, 0.45)] * 4),
     snap=st.sampled_from([1, 500]),
     params=st.sampled_from([SMALL, FINE]),
+    decreed=st.sampled_from([0.0, 0.05, 0.6]),
 )
-def test_what_is_proven_in_a_crop_is_true_of_the_whole(seed, fraction, snap, params):
+def test_what_is_proven_in_a_crop_is_true_of_the_whole(seed, fraction, snap, params, decreed):
     points = scene(seed, snap=snap)
-    whole = classify(cloud_from_grid(*points.T), params)
+    fixed = np.random.default_rng(seed).random(len(points)) < decreed if decreed else None
+    whole = classify(cloud_from_grid(*points.T, fixed), params)
     assert not whole.unproven.any()
     (x0, y0, _), (x1, y1, _) = points.min(axis=0), points.max(axis=0) + 1
     w, h = x1 - x0, y1 - y0
     a, b, c, d = fraction
     rect = Rect(int(x0 + a * w), int(y0 + b * h), int(x1 - c * w), int(y1 - d * h))
-    inside, cloud = crop(points, rect)
+    inside, cloud = crop(points, rect, fixed)
     cut = classify(cloud, params)
     proven = ~cut.unproven
     assert np.array_equal(cut.ground[proven], whole.ground[inside][proven])
@@ -95,6 +98,23 @@ def test_what_falls_at_once_is_a_building_what_falls_step_by_step_a_dam(flank, g
     found = classify_ground(np.column_stack([x, y, z]))
     assert found[crest].mean() == pytest.approx(ground, abs=0.02)
     assert found[(across > flank + 1) | (along > flank + 1)].mean() > 0.99
+
+
+def test_a_decreed_point_in_a_square_that_is_not_known_proves_nothing_about_its_patch():
+    params = RobustParams(cell_size=2.0, refinement=1)
+    rng = np.random.default_rng(1)
+    column, row = (np.repeat(v.ravel(), 3) for v in np.meshgrid(np.arange(-64, 112), np.arange(-64, 80)))
+    x, y = (v * 2000 + rng.integers(0, 2000, len(v)) for v in (column, row))
+    high = (column >= 16) | ((column >= 6) & (row >= 4) & (row < 12))
+    z = np.where(high, 10_000, 4_000) + rng.integers(-20, 20, len(x))
+    points, fixed, spur = np.column_stack([x, y, z]), column >= 16, high & (column < 16)
+    whole = classify(cloud_from_grid(*points.T, fixed), params)
+    assert whole.ground[spur].mean() > 0.8
+    for columns in (28, 112):
+        inside, cloud = crop(points, Rect(-128_000, -128_000, columns * 2000, 160_000), fixed)
+        cut = classify(cloud, params)
+        proven = ~cut.unproven
+        assert np.array_equal(cut.ground[proven], whole.ground[inside][proven])
 
 
 def test_a_wide_crop_proves_its_middle():

@@ -9,6 +9,7 @@ from numba import njit
 
 from ppdf_dask.filters.ppdf.compiled import leaf
 from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, ROOF, UNPROVEN
+from ppdf_dask.filters.ppdf.robust.planes import NOT_KNOWN_PATCH
 
 STEP = 0.5
 """Metres below a patch's plane at which a low point lies partway down."""
@@ -61,7 +62,7 @@ def link_patches(
                     continue
                 for dr in range(-near, near + 1):
                     for j in range(k + dr * width - near, k + dr * width + near + 1):
-                        if state[j] & UNPROVEN:
+                        if state[j] & UNPROVEN or patch[j] == NOT_KNOWN_PATCH:
                             open_[p] = True
                         q = patch[j]
                         if q <= p:
@@ -143,7 +144,7 @@ def judge_components(
                 if patch[j] >= 0 and parent[patch[j]] == root:
                     inside = True
                     break
-                if state[j] & UNPROVEN:
+                if state[j] & UNPROVEN or patch[j] == NOT_KNOWN_PATCH:
                     open_[root] = True
                 if state[j] & LOW and far * cell <= reach and not falls:
                     fall = drop + 0.5 * tilt * far * (cell * 1e-3)

@@ -11,6 +11,9 @@ from ppdf_dask.filters.ppdf.compiled import leaf
 from ppdf_dask.filters.ppdf.hashing import below, cell_seed
 from ppdf_dask.filters.ppdf.robust.cells import FIXED, LOW, MAYBE_DROPPED, REF, SQUARE, UNPROVEN
 
+NOT_KNOWN_PATCH = np.int32(-2)
+"""Patch of a fixed low point, itself proven, whose square is not known as a whole; other negative: no patch."""
+
 
 @leaf
 def _fit(xs: Any, ys: Any, zs: Any, n: Any, seed: Any, trials: Any, t_in: Any, best: Any) -> Any:
@@ -82,7 +85,9 @@ def find_planes(
             if unknown:
                 for r in range(row0, row0 + SQUARE):
                     for k in range(r * width + col0, r * width + col0 + SQUARE):
-                        if state[k] & LOW and not state[k] & FIXED:
+                        if state[k] & FIXED:
+                            patch[k] = NOT_KNOWN_PATCH
+                        elif state[k] & LOW:
                             state[k] |= UNPROVEN | MAYBE_DROPPED
                 continue
             top = 1
