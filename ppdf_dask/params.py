@@ -70,7 +70,8 @@ class Parameters:
             if f.metadata.get("unit") is not None:
                 _check_quantity(f, value)
                 if int in (hints[f.name], *typing.get_args(hints[f.name])) and not isinstance(value, int | None):
-                    raise ParameterError(f"{f.name} = {value!r} {f.metadata['unit']} is not a whole number")
+                    unit = "" if f.metadata["unit"] == "1" else f" {f.metadata['unit']}"
+                    raise ParameterError(f"{f.name} = {value!r}{unit} is not a whole number")
             elif hints[f.name] is bool and not isinstance(value, bool):
                 raise ParameterError(f"{f.name} = {value!r} is neither true nor false")
             elif typing.get_origin(hints[f.name]) is Literal:
