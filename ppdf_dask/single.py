@@ -70,8 +70,7 @@ def _ground(job: TileJob, size: int) -> tuple[Bools, list[Labels]]:
     for batch in job.batches(size):
         seen = batch.eligible
         parts.append(np.stack([batch.x[seen], batch.y[seen], batch.z[seen], batch.fixed[seen].astype(np.int64)]))
-        # Copies, for a view would keep the whole records alive.
-        labels.append(Labels(batch.returns.copy(), batch.flags.copy(), batch.classification, seen))
+        labels.append(batch.labels)
     points = np.concatenate(parts, axis=1) if parts else np.empty((4, 0), np.int64)
     fixed = points[3].astype(np.bool_) if job.params.classes.mode == "refine" else None
     try:
