@@ -189,7 +189,7 @@ def _decoder(job: TileJob, header: Header) -> Decoder:
 def _decoded(job: TileJob, header: Header, ground_of: GroundOf) -> Kept:
     """Decode a file again, without heights."""
     decoder, start = _decoder(job, header), 0
-    for raw in tile_records(job.tile, header, whole_chunks(header, at_once(header)), PLACES | CLASSES | FLAGS):
+    for raw in tile_records(job.tile, header, whole_chunks(header), PLACES | CLASSES | FLAGS):
         batch = decoder.measure(np.frombuffer(raw, decoder.dtype), start, heights=False)
         start += batch.n
         yield batch.labels, ground_of(batch)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from ppdf_dask.errors import TileError
 from ppdf_dask.lasheader import Header, Reject, read_header
 from ppdf_dask.layers import CLASSES, LayeredChunk, chunks
-from ppdf_dask.reader import Labels
+from ppdf_dask.reader import Labels, at_once
 from ppdf_dask.tiles import shown
 
 Bytes = npt.NDArray[np.uint8]
@@ -66,11 +66,11 @@ def can_relabel(header: Header, most_points: int) -> bool:
     return usual and tidy and apart and header.point_count > 0 and laszip.chunk_size <= most_points
 
 
-def whole_chunks(header: Header, most: int) -> int:
-    """Return the points of as many whole chunks as hold at most so many."""
+def whole_chunks(header: Header) -> int:
+    """Return the points of as many whole chunks as are decoded at once."""
     assert header.laszip is not None
     assert header.laszip.chunk_size is not None
-    return most // header.laszip.chunk_size * header.laszip.chunk_size
+    return at_once(header) // header.laszip.chunk_size * header.laszip.chunk_size
 
 
 def relabel(source: str, header: Header, target: Path, labelled: Labelled) -> None:

@@ -57,7 +57,7 @@ def classify_tile(survey: Survey, target: str | Path, params: RunParams | None =
     header = header_of(tile)
     # A layered file's new classes need no more than its labels: it is decoded once.
     once = target.suffix != ".las" and can_relabel(header, at_once(header))
-    ground, labels = _ground(job, whole_chunks(header, at_once(header)) if once else BATCH)
+    ground, labels = _ground(job, whole_chunks(header) if once else BATCH)
     cursor = _Cursor(ground)
     kept = ((part, cursor.take(part)) for part in labels) if once else None
     record = rewrite(job, target, lambda batch: cursor.take(batch.labels), kept)

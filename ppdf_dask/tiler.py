@@ -168,7 +168,7 @@ def cut(store: RunStore, job: TileJob) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="ppdf-tile-") as folder:
         spool = _Spool(Path(folder))
         cells: dict[str, npt.NDArray[np.bool_]] = {}
-        for number, batch in enumerate(job.batches(whole_chunks(header, at_once(header)) if keep else BATCH)):
+        for number, batch in enumerate(job.batches(whole_chunks(header) if keep else BATCH)):
             facts.add(batch)
             owners = _spread(job, batch, spool, cells)
             keep = keep and keep_labels(store, job.source, number, batch.labels, owners)

@@ -278,13 +278,12 @@ def _tile_work(job: TileJob) -> tuple[float, float, float]:
     """Return the processor seconds of decoding a tile, of writing it with new classes and of reading that again."""
     from ppdf_dask.lasheader import read_header
     from ppdf_dask.merge import class_counts
-    from ppdf_dask.reader import at_once
     from ppdf_dask.relabel import differs, relabel, whole_chunks
 
     path = job.tile.path
     header = read_header(path)
     labels: list[Labels] = []
-    decode = _cpu(lambda: labels.extend(b.labels for b in job.batches(whole_chunks(header, at_once(header)))))
+    decode = _cpu(lambda: labels.extend(b.labels for b in job.batches(whole_chunks(header))))
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "again.laz"
         encode = _cpu(lambda: relabel(path, header, target, ((part, part.classification) for part in labels)))
