@@ -60,7 +60,7 @@ def measure(corners, p, params):
     return d, margin
 
 
-def test_facet(tin, corners, p, params):
+def against_facet(tin, corners, p, params):
     normal = np.cross(*(np.subtract(v, corners[0]) for v in corners[1:]))
     slope = math.degrees(math.atan2(math.hypot(*normal[:2]), abs(normal[2])))
     d, margin = measure(corners, p, params)
@@ -70,9 +70,6 @@ def test_facet(tin, corners, p, params):
         there = tin.facet(image)
         return (INF, -INF) if there is None else measure(there, image, params)
     return d, margin
-
-
-test_facet.__test__ = False
 
 
 class Noise(Exception):
@@ -104,7 +101,7 @@ def oracle(pts, params):
         best = {}
         for k, p in enumerate(open_):
             corners = tin.facet(p)
-            d, margin = test_facet(tin, corners, p, params)
+            d, margin = against_facet(tin, corners, p, params)
             if abs(margin) < 1e-6:
                 raise Noise
             if margin > 0 and max(math.dist(a[:2], b[:2]) for a in corners for b in corners) >= spacing:
@@ -127,7 +124,7 @@ def oracle(pts, params):
         elif params.label == "vertices":
             out.append(False)
         else:
-            d, margin = test_facet(tin, tin.facet(p), p, params)
+            d, margin = against_facet(tin, tin.facet(p), p, params)
             if abs(margin) < 1e-6 or abs(d - params.tolerance * 1000) < 1e-6:
                 raise Noise
             out.append(margin > 0 or d < params.tolerance * 1000)
