@@ -142,7 +142,11 @@ def differs(source: str, header: Header, target: Path) -> str:
                 return f"its chunk at byte {ours.position} differs"
         assert header.laszip is not None
         new.seek(header.offset_to_points)
-        if [size for _, size in lazrs.read_chunk_table(new, lazrs.LazVlr(header.laszip.record))] != sizes:
+        try:
+            table = lazrs.read_chunk_table(new, lazrs.LazVlr(header.laszip.record))
+        except lazrs.LazrsError as error:
+            return f"its chunk table cannot be read: {error}"
+        if [size for _, size in table] != sizes:
             return "its chunk table differs"
         old.seek(header.evlrs[0])
         new.seek(new_header.evlrs[0])

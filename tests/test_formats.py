@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 from pathlib import Path
 
 import lasfiles
@@ -210,6 +211,28 @@ def test_f15_waveforms_inside_the_file_stay_where_the_header_says(tmp_path, poin
     assert (all_but_class(after) == all_but_class(before)).all()
     if version == "1.4":
         assert [v.description for v in after.evlrs] == [NAMES[1], ""]
+
+
+@pytest.mark.parametrize("claimed", [0, 1000, 100_000])
+@pytest.mark.parametrize("behind", [0, 1])
+def test_f15_waveforms_are_kept_whatever_length_they_claim(tmp_path, claimed, behind):
+    """A recorder that was not closed leaves a length of zero; where the next record begins the waveforms end."""
+    source = tmp_path / "a.las"
+    write(source, 9, "1.4")
+    raw = bytearray(source.read_bytes())
+    evlrs, count = struct.unpack_from("<QI", raw, 235)
+    raw = raw[: evlrs if count else len(raw)]
+    waves = struct.pack("<H16sHQ32s", 0, b"LASF_Spec", 65535, claimed, b"") + b"W" * 1000
+    extra = struct.pack("<H16sHQ32s", 0, b"somebody", 1, 50, b"") + b"E" * 50
+    raw[6] |= 0b10
+    struct.pack_into("<QQI", raw, 227, len(raw), len(raw + waves) if behind else 0, behind)
+    source.write_bytes(raw + waves + extra * behind)
+    result = plan(scan([source]), params(), out=tmp_path / "run").run(Inline())
+    copy = result.tiles[0].read_bytes()
+    at, first, number = struct.unpack_from("<QQI", copy, 227)
+    assert copy[at : at + len(waves)] == waves
+    assert number == behind
+    assert copy[first : first + 110] == extra or not behind
 
 
 @pytest.mark.parametrize(("point_format", "version"), [(4, "1.3"), (5, "1.4"), (9, "1.4"), (10, "1.4")])

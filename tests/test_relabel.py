@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import resource
+
 import laspy
+import lazrs
 import numpy as np
 import pytest
 from lasfiles import LEGACY_COUNT, patch, points, write
 
-from ppdf_dask import kept, merge
+from ppdf_dask import kept, merge, relabel
 from ppdf_dask.errors import DamagedError, TileError
 from ppdf_dask.grid import ChunkGrid
 from ppdf_dask.lasheader import read_header
 from ppdf_dask.layers import chunks
 from ppdf_dask.merge import MergeJob
 from ppdf_dask.params import RunParams
-from ppdf_dask.relabel import can_relabel
+from ppdf_dask.relabel import can_relabel, differs
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import scan
 from ppdf_dask.tiler import TileJob, cut
@@ -106,6 +109,43 @@ def test_a_byte_that_is_not_as_written_is_seen(tmp_path, monkeypatch, what):
     assert [p.name for p in tmp_path.iterdir()] == ["a.laz"]
 
 
+def test_a_chunk_table_that_is_not_as_written_is_seen(tmp_path):
+    """Readers that go from start to end do not need it, so that nothing else would tell."""
+    job = job_of(source(tmp_path / "a.laz"))
+    target = tmp_path / "b.laz"
+    merge.rewrite(job, target, every_third)
+    old, new = read_header(job.tile.path), read_header(str(target))
+    good = target.read_bytes()
+
+    def table():
+        with target.open("rb") as file:
+            file.seek(new.offset_to_points)
+            return lazrs.read_chunk_table(file, lazrs.LazVlr(new.laszip.record))
+
+    right, wrong = table(), 0
+    for byte in range(new.laszip.table + 12, new.evlrs[0]):
+        for bit in (0x01, 0x40):
+            target.write_bytes(good[:byte] + bytes((good[byte] ^ bit,)) + good[byte + 1 :])
+            if table() != right:
+                wrong += 1
+                assert "chunk table" in differs(job.tile.path, old, target)
+    assert wrong > 0
+
+
+@pytest.mark.parametrize("point_format", [3, 7])
+def test_f35_a_full_disk_is_a_sentence_whichever_way_a_tile_is_written(tmp_path, point_format):
+    path = tmp_path / "a.laz"
+    write(path, points(N), point_format=point_format)
+    job, soft = job_of(path), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, soft[1]))
+    try:
+        with pytest.raises(TileError, match=r"a\.laz could not be written to .*b\.laz"):
+            merge.rewrite(job, tmp_path / "b.laz", every_third)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, soft)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.laz"]
+
+
 def test_untidy_files_are_written_in_full(tmp_path):
     path = write(tmp_path / "a.laz", points(1000), point_format=7)
     path.write_bytes(path.read_bytes()[:-5] + bytes(5))
@@ -126,12 +166,14 @@ def test_a_wrong_old_count_is_handed_on_by_both(tmp_path, monkeypatch):
     assert laspy.read(tmp_path / "full.laz").header.point_count == N
 
 
-def test_other_formats_and_large_chunks_are_written_in_full(tmp_path):
+def test_other_formats_large_chunks_and_large_records_are_written_in_full(tmp_path, monkeypatch):
     layered = read_header(str(source(tmp_path / "a.laz")))
     assert can_relabel(layered, 50_000)
     assert not can_relabel(layered, 49_999)
     assert not can_relabel(read_header(str(write(tmp_path / "old.laz", point_format=1))), merge.BATCH)
     assert not can_relabel(read_header(str(write(tmp_path / "plain.las"))), merge.BATCH)
+    monkeypatch.setattr(relabel, "_LARGE", 1000)  # of the EVLR, and its head
+    assert not can_relabel(layered, 50_000)
 
 
 def cut_small(tmp_path, most_owners):
