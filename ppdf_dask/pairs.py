@@ -1,4 +1,4 @@
-"""Tiles that belong together by mistake: the same file twice, and bounds that overlap."""
+"""Tiles that belong together by mistake: the same file twice, bounds that overlap, the same points in two files."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from ppdf_dask.errors import SurveyError
+from ppdf_dask.errors import SurveyError, TileError
 from ppdf_dask.lasheader import Header
+from ppdf_dask.repeats import PAIRS, SHARE, share_of_same_points
 from ppdf_dask.tiles import Problem, Tile, named, shown
 
 Duplicates = Literal["error", "keep", "first"]
@@ -103,6 +104,34 @@ def find_overlaps(tiles: Sequence[Tile]) -> tuple[Overlap, ...]:
             if along > slack:
                 found.append(_overlap(placed[order[i]], placed[order[i + 1 + j]], int(along) * int(across[j])))
     return tuple(sorted(found, key=lambda o: (o.first, o.second)))
+
+
+def refuse_same_points(tiles: Sequence[Tile], overlaps: Sequence[Overlap], unit_xy: float, unit_z: float) -> None:
+    """Refuse tiles that hold the same points: the pairs that overlap most are read for it, in part.
+
+    Raises
+    ------
+    SurveyError
+        Naming the pairs. A damaged file is passed over here; the run names it.
+    """
+    by_path, lines = {t.path: t for t in tiles}, []
+    for pair in sorted(overlaps, key=lambda o: (-o.share, o.first, o.second))[:PAIRS]:
+        try:
+            share = share_of_same_points(by_path[pair.first], by_path[pair.second], unit_xy, unit_z)
+        except TileError:
+            continue
+        if share >= SHARE:
+            lines.append(
+                f"{shown(pair.first)} and {shown(pair.second)} overlap by {pair.share:.1%} and have {share:.0%} "
+                "of their points there in common"
+            )
+    if lines:
+        more = f" ({len(overlaps)} pairs overlap, the {PAIRS} largest were looked at)" if len(overlaps) > PAIRS else ""
+        raise SurveyError(
+            f"tiles hold the same points, which would count twice{more}:\n{named(lines)}\n"
+            "Remove the buffers or the older delivery, or use --duplicates keep: all points are kept, equal ones get "
+            "one label."
+        )
 
 
 def _candidates(boxes: npt.NDArray[np.int64], axis: int, slack: int) -> int:

@@ -31,10 +31,11 @@ from ppdf_dask.plan import Plan
 from ppdf_dask.quarantine import Failure, write_failures, write_json
 from ppdf_dask.raster import create
 from ppdf_dask.repair import heal, sweep, take_notes
+from ppdf_dask.repeats import shared_problems
 from ppdf_dask.saved import save_plan
 from ppdf_dask.stages import Cutting, Inputs, Records, Waiting
 from ppdf_dask.store import RunStore
-from ppdf_dask.tiles import problem_dict, shown
+from ppdf_dask.tiles import Problem, problem_dict, shown
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -105,6 +106,7 @@ class _Run:
     chunks: Records = field(default_factory=dict)
     merged: Records = field(default_factory=dict)
     blocks: Records = field(default_factory=dict)
+    odd: list[Problem] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.store = RunStore(str(self.plan.out / "run.zarr"))
@@ -146,11 +148,15 @@ class _Run:
         """Cut the source files; afterwards a place without fragments is known to be empty."""
         self.tiles = self._stage("tile", tasks.tile, self.inputs.tile_works())
         sources, unit = self.inputs.sources, self.plan.survey.unit_xy
-        self.odd = [p for s, record in self.tiles.items() for p in oddities(sources[s], record, unit)]
-        for line in in_short(self.odd):
-            self.on_event(Event("tile", "noted", record={"warning": line}))
+        self.odd = []
+        self._note([p for s, record in self.tiles.items() for p in oddities(sources[s], record, unit)])
         self.cutting = Cutting(self.inputs, self.store, self.tiles)
         self.cutting.index.publish(self.store)
+
+    def _note(self, odd: list[Problem]) -> None:
+        self.odd += odd
+        for line in in_short(odd):
+            self.on_event(Event("tile", "noted", record={"warning": line}))
 
     def density(self) -> Density:
         """Return points and occupied cells of the survey."""
@@ -162,6 +168,9 @@ class _Run:
         self.chunks = self._stage(
             "classify", tasks.classify, works, lambda _, record: self.cutting.still_proven(record)
         )
+        looked_at = {source: record["eligible"] for source, record in self.tiles.items()}
+        shared = list(shared_problems(self.inputs.sources, looked_at, [r["shared"] for r in self.chunks.values()]))
+        self._note(shared)
 
     def merge(self) -> None:
         """Write each source file again, classified."""
@@ -282,6 +291,7 @@ class _Run:
                 "eligible": sum(r["eligible"] for r in self.tiles.values()),
                 "ground": sum(r["ground"] for r in self.chunks.values()),
                 "unproven": sum(r["unproven"] for r in self.chunks.values()),
+                "repeated": sum(r["repeated"] for r in self.chunks.values()),
                 "chunks": len(self.chunks),
                 "blocks": len(self.blocks),
             },

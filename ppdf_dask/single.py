@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ppdf_dask import filters
+from ppdf_dask.checksums import check_sha256
 from ppdf_dask.errors import ParameterError, SurveyError, TileError
 from ppdf_dask.filters.cloud import cloud_from_grid, density
 from ppdf_dask.grid import ChunkGrid
@@ -54,6 +55,7 @@ def classify_tile(survey: Survey, target: str | Path, params: RunParams | None =
         raise SurveyError(f"{target} is the input itself; give another name for the output")
     params = params or RunParams()
     job = TileJob("s_000000", tile, survey.unit_xy, survey.unit_z, params, ChunkGrid.from_metres(1000.0), 0)
+    check_sha256(tile)
     header = header_of(tile)
     # A layered file's new classes need no more than its labels: it is decoded once.
     once = target.suffix != ".las" and can_relabel(header, at_once(header))

@@ -65,7 +65,7 @@ class Inputs:
         return {
             "version": __version__,
             "code": code(),
-            "inputs": {t.name: [t.path, t.size, t.mtime_ns] for t in self.sources.values()},
+            "inputs": {t.name: [t.path, t.size, t.mtime_ns, *filter(None, [t.sha256])] for t in self.sources.values()},
             "crs": p.survey.crs,
             "units": [p.survey.unit_xy, p.survey.unit_z],
             "params": p.params.as_dict(),
@@ -87,7 +87,7 @@ class Inputs:
                 [p.survey.unit_xy, p.survey.unit_z],
             ]
         )
-        return {s: digest([how, t.path, t.name, t.size, t.mtime_ns]) for s, t in self.sources.items()}
+        return {s: digest([how, t.path, t.name, t.size, t.mtime_ns, t.sha256]) for s, t in self.sources.items()}
 
     def tile_job(self, source: str) -> TileJob:
         """Return what a worker needs to cut a tile."""

@@ -1,9 +1,11 @@
-"""The header-only scan: files in, a `Survey` out. No point is read; a tile costs a few kilobytes of reading."""
+"""The header-only scan: files in, a `Survey` out. A tile costs a few kilobytes of reading.
+
+Points are read only where a header is impossible or tiles overlap.
+"""
 
 from __future__ import annotations
 
 import os
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,14 +13,23 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from ppdf_dask import crs as crs_module
+from ppdf_dask.checksums import with_checksums
 from ppdf_dask.crs import Frame
 from ppdf_dask.errors import SurveyError, TileError
+from ppdf_dask.frames import common_frame, frame_of, remedy
 from ppdf_dask.grid import MM, Rect
 from ppdf_dask.lasheader import Header, Reject, read_header
-from ppdf_dask.pairs import Duplicates, Overlap, duplicate_problems, find_duplicates, find_overlaps
+from ppdf_dask.pairs import (
+    Duplicates,
+    Overlap,
+    duplicate_problems,
+    find_duplicates,
+    find_overlaps,
+    refuse_same_points,
+)
 from ppdf_dask.params import ClassRules
 from ppdf_dask.reader import batches
-from ppdf_dask.tiles import Problem, Tile, bounds_in_mm, find_files, named, output_names, problem_dict, shown
+from ppdf_dask.tiles import Problem, Tile, bounds_in_mm, find_files, named, output_names, problem_dict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -152,6 +163,7 @@ def scan(
     assume_units: crs_module.Units | None = None,
     duplicates: Duplicates = "error",
     skip_bad: bool = False,
+    checksums: str | os.PathLike[str] | None = None,
 ) -> Survey:
     """Read the headers of a delivery.
 
@@ -165,9 +177,12 @@ def scan(
         The unit of x, y and z, whatever the CRS says. Default: the CRS's own; metres when no tile has a CRS.
     duplicates : {"error", "keep", "first"}
         What to do with the same file found twice: refuse (the default, since points would count twice), keep both, or
-        use the first by path.
+        use the first by path. Tiles that overlap and have the same points there are refused unless all are kept.
     skip_bad : bool
         Leave files with fatal problems out, and list them in `Survey.problems`, instead of refusing the survey.
+    checksums : path-like, optional
+        A list as ``sha256sum`` writes it. Each tile is compared with it when its points are read; what is not listed or
+        not there is noted.
 
     Returns
     -------
@@ -199,19 +214,19 @@ def scan(
             problems.append(Problem(path, reject.code, reject.message, True))
             continue
         problems += [Problem(path, code, message, False) for code, message in header.warnings]
-        frames[path] = _frame(header, assumed)
+        frames[path] = frame_of(header, assumed)
         boxes[path] = header.mins, header.maxs
         # The records' own bytes would be most of the memory of a large survey.
         headers[path] = replace(header, wkt=None, geo_keys=None)
     for path, frame in frames.items():
         fault = frame.fault
         if fault is not None and not (units is not None and fault[0] in ("crs-unreadable", "units")):
-            problems.append(Problem(path, fault[0], fault[1] + _remedy(fault[0]), True))
+            problems.append(Problem(path, fault[0], fault[1] + remedy(fault[0]), True))
     _refuse(problems, skip_bad)
     bad = {p.path for p in problems if p.fatal}
     good = {path: h for path, h in headers.items() if path not in bad}
 
-    reference, notes = _common_frame({path: frames[path] for path in good}, units)
+    reference, notes = common_frame({path: frames[path] for path in good}, units)
     problems += notes
     twins = find_duplicates(good)
     problems += duplicate_problems(repeated, twins, duplicates)
@@ -229,14 +244,21 @@ def scan(
     _refuse(problems, skip_bad)
     bad = {p.path for p in problems if p.fatal}
     problems = [_placed(p, boxes.get(p.path), reference) for p in problems]
-    return Survey(
-        tiles=tuple(t for t in tiles if t.path not in bad),
+    kept = tuple(t for t in tiles if t.path not in bad)
+    if checksums is not None:
+        kept, notes = with_checksums(kept, checksums)
+        problems += notes
+    found = Survey(
+        tiles=kept,
         root=root,
         crs=reference.wkt,
         unit_xy=reference.unit_xy or 1.0,
         unit_z=reference.unit_z or reference.unit_xy or 1.0,
         problems=tuple(sorted(problems, key=lambda p: (p.path, not p.fatal, p.code))),
     )
+    if duplicates != "keep":
+        refuse_same_points(found.tiles, found.overlaps, found.unit_xy, found.unit_z)
+    return found
 
 
 def _placed(problem: Problem, box: Any, frame: Frame) -> Problem:
@@ -249,19 +271,6 @@ def _placed(problem: Problem, box: Any, frame: Frame) -> Problem:
     return problem if found is None else replace(problem, place=(found[0].x0, found[0].y0, found[0].x1, found[0].y1))
 
 
-def _frame(header: Header, assumed: Frame | None) -> Frame:
-    frame = crs_module.from_records(header.wkt, header.geo_keys, header.wkt_first)
-    if assumed is not None and (frame is crs_module.NOTHING or (frame.fault and frame.fault[0] == "crs-unreadable")):
-        return assumed
-    return frame
-
-
-def _remedy(code: str) -> str:
-    if code == "crs-unreadable":
-        return "; say what it is with --assume-crs, or only its unit with --assume-units"
-    return "; say which unit it is with --assume-units" if code == "units" else ""
-
-
 def _refuse(problems: Sequence[Problem], skip_bad: bool) -> None:
     """Raise for fatal problems unless they may be skipped."""
     fatal = [p for p in problems if p.fatal]
@@ -272,74 +281,6 @@ def _refuse(problems: Sequence[Problem], skip_bad: bool) -> None:
         f"{files} file{'s' if files > 1 else ''} cannot be used:\n{named(map(str, fatal))}\n"
         "Repair or remove them, or leave them out with --skip-bad (skip_bad=True)."
     )
-
-
-def _common_frame(frames: dict[str, Frame], units: float | None) -> tuple[Frame, list[Problem]]:
-    """Return the one CRS and units of all files, or refuse."""
-    if not frames:
-        raise SurveyError("no tile is left to work on; every file has a problem")
-    by_frame: dict[Frame, list[str]] = defaultdict(list)
-    for path, frame in sorted(frames.items()):
-        by_frame[Frame(frame.wkt, frame.unit_xy, frame.unit_z)].append(path)
-    missing = [path for frame, group in by_frame.items() if frame.wkt is None for path in group]
-    known = [frame for frame in by_frame if frame.wkt is not None]
-    notes: list[Problem] = []
-    if missing and known:
-        raise SurveyError(
-            f"{len(missing)} of {len(frames)} tiles have no CRS:\n{named(map(shown, missing))}\n"
-            "Say what it is with --assume-crs (assume_crs=), or scan them on their own."
-        )
-    if not known:
-        unit = 1.0 if units is None else units
-        said = "taken to be metres" if units is None else f"in {crs_module.unit_name(unit)}, as --assume-units says"
-        notes.append(Problem("", "crs-missing", f"no tile has a CRS; coordinates are {said}", False))
-        return Frame(None, unit, unit), notes
-    reference = _merge_frames(known, by_frame, notes)
-    if units is not None:
-        return Frame(reference.wkt, units, units), notes
-    if reference.unit_z is None:
-        name = crs_module.unit_name(reference.unit_xy or 1.0)
-        if reference.unit_xy != 1.0:
-            message = f"the CRS says nothing of heights; they are taken to be in its horizontal unit, {name}"
-            notes.append(Problem("", "height-unit", message, False))
-        return Frame(reference.wkt, reference.unit_xy, reference.unit_xy), notes
-    return reference, notes
-
-
-def _merge_frames(known: list[Frame], by_frame: dict[Frame, list[str]], notes: list[Problem]) -> Frame:
-    """Return the most complete of equivalent frames; refuse a true mix."""
-    groups: list[list[Frame]] = []
-    for frame in known:
-        home = next((g for g in groups if crs_module.compare(g[0].wkt or "", frame.wkt or "") != "different"), None)
-        if home is None:
-            groups.append([frame])
-        else:
-            home.append(frame)
-    if len(groups) > 1:
-        parts = []
-        for group in groups:
-            paths = sorted(path for frame in group for path in by_frame[frame])
-            parts.append(f"{crs_module.crs_name(group[0].wkt)}, {len(paths)} tiles:\n{named(map(shown, paths))}")
-        raise SurveyError(
-            "the tiles have different coordinate reference systems:\n"
-            + "\n".join(parts)
-            + "\nReproject them to one, or run each group on its own."
-        )
-    group = groups[0]
-    full = [f for f in group if f.unit_z is not None] or group
-    bare = [path for f in group if f.unit_z is None for path in by_frame[f]]
-    heights = {f.unit_z for f in full}
-    unlike = any(crs_module.compare(full[0].wkt or "", f.wkt or "") == "different" for f in full)
-    if len(heights) > 1 or unlike or (bare and full is not group and heights != {full[0].unit_xy}):
-        lines = [f"{crs_module.crs_name(f.wkt)}: {shown(by_frame[f][0])} ..." for f in group]
-        raise SurveyError(
-            f"the tiles agree in the plane but not in height:\n{named(lines)}\n"
-            "Bring them to one height system, or say the unit of all with --assume-units."
-        )
-    if bare and full is not group:
-        message = f"{len(bare)} tiles say nothing of their heights; they are taken to be like the others"
-        notes.append(Problem("", "height-missing", message, False))
-    return full[0]
 
 
 def _tile(path: str, name: str, header: Header, frame: Frame) -> tuple[Tile, list[Problem]]:

@@ -24,6 +24,7 @@ from ppdf_dask.ledger import Ledger
 from ppdf_dask.merge import MergeJob, crc32_of, write_tile
 from ppdf_dask.mosaic import open_dtm, write_cog
 from ppdf_dask.raster import RasterJob
+from ppdf_dask.repeats import repeats
 from ppdf_dask.solve import ClassifyJob, solve
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiler import TileJob, cut
@@ -100,6 +101,7 @@ def classify(url: str, job: ClassifyJob, fingerprint: str) -> dict[str, Any]:
     clock, store = _Clock(), RunStore(url, fingerprint)
     found = solve(store, job)
     n = len(found.ground)
+    repeated, shared = repeats(found.core, found.counts)
     store.write_classification(job.chunk.id, found.ground, found.counts)
     store.write_ground(job.chunk.id, found.core[:3, found.ground])
     record = {
@@ -110,6 +112,8 @@ def classify(url: str, job: ClassifyJob, fingerprint: str) -> dict[str, Any]:
         "loaded_most": max(found.loaded),
         "ground": int(found.ground.sum()),
         "unproven": int(found.unproven.sum()),
+        "repeated": repeated,
+        "shared": shared,
         "buffer_m": found.width / 1000,
         "tries": found.tries,
         "full": found.full,

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ppdf_dask.checksums import check_sha256
 from ppdf_dask.errors import TileError
 from ppdf_dask.filters.cloud import LIMIT
 from ppdf_dask.grid import DENSITY_CELL, MM, ChunkGrid, Rect
@@ -163,6 +164,7 @@ def cut(store: RunStore, job: TileJob) -> dict[str, Any]:
     TileError
         Damaged or changed file; nothing of it counts until its record is published.
     """
+    check_sha256(job.tile)
     facts, header = _Facts(), header_of(job.tile)
     keep = can_relabel(header, at_once(header)) and job.tile.point_count >= WORTH_KEEPING
     with tempfile.TemporaryDirectory(prefix="ppdf-tile-") as folder:

@@ -81,6 +81,8 @@ class Tile:
         Extended variable length records behind the points.
     guid : str
         Project id of the header, 32 hexadecimal digits.
+    sha256 : str or None
+        What a list of checksums says of the file; None without one.
     """
 
     path: str
@@ -101,6 +103,7 @@ class Tile:
     copc: bool
     evlr_count: int
     guid: str
+    sha256: str | None = None
 
     @property
     def density(self) -> float | None:

@@ -51,6 +51,7 @@ TABLE: dict[str, tuple[str, list[str] | str]] = {
             "reader::f5_flipped_bytes_end_in_points_or_a_tile_error",
             "faults_damage::f5_a_broken_tile_leaves_its_place_unknown_and_the_rest_is_done",
             "faults_damage::a_file_that_is_left_out_leaves_its_place_unknown_too",
+            "checksums::f5_another_byte_is_found_and_the_rest_is_done",
         ],
     ),
     "F6": (
@@ -75,11 +76,22 @@ TABLE: dict[str, tuple[str, list[str] | str]] = {
     ),
     "F10": (
         "duplicate points",
-        ["faults::f10_duplicates_keep_their_classes", "formats::f6_f10_collinear_and_equal_points"],
+        [
+            "faults::f10_duplicates_keep_their_classes",
+            "formats::f6_f10_collinear_and_equal_points",
+            "repeats::f10_repeats_are_counted",
+            "repeats::f10_f11_a_run_counts_them_and_names_the_tiles",
+        ],
     ),
     "F11": (
         "the same tile twice, overlaps",
-        ["survey::f11_named_twice", "survey::f11_copies_and_links", "survey::f11_a_millimetre_is_tolerated"],
+        [
+            "survey::f11_named_twice",
+            "survey::f11_copies_and_links",
+            "survey::f11_a_millimetre_is_tolerated",
+            "repeats::f11_tiles_with_common_points_are_refused_by_name",
+            "repeats::f11_flight_lines_over_one_another_are_no_duplicates",
+        ],
     ),
     "F12": (
         "mixed, missing, equivalent, geographic CRS",

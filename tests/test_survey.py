@@ -598,14 +598,16 @@ def test_f11_copies_and_links(tmp_path, link):
 
 
 def test_f11_equal_headers_are_not_enough(tmp_path):
-    """Same size, bounds and count, other points: no duplicate."""
+    """Same size, bounds and count, one point another: no duplicate, but the same points."""
     mm = points(20)
     inner = mm.copy()
     middle = [k for k in range(20) if not any(mm[k, c] in (mm[:, c].min(), mm[:, c].max()) for c in range(3))]
     inner[middle[0], 2] += 1
     write(tmp_path / "a.las", mm)
     write(tmp_path / "b.las", inner)
-    assert len(scan(tmp_path).tiles) == 2
+    with pytest.raises(SurveyError, match="95% of their points there in common"):
+        scan(tmp_path)
+    assert "duplicate" not in codes(scan(tmp_path, duplicates="keep"))
 
 
 def tile_at(name, x0, y0, x1, y1, n=10):

@@ -40,9 +40,15 @@ survey_options = stack(
         type=click.Choice(["error", "keep", "first"]),
         default="error",
         show_default=True,
-        help="What to do with the same tile given twice.",
+        help="What to do with a tile given twice, or with points that two tiles share (error or keep).",
     ),
     click.option("--skip-bad", is_flag=True, help="Leave out unreadable tiles instead of stopping."),
+    click.option(
+        "--checksums",
+        type=click.Path(exists=True, dir_okay=False),
+        metavar="LIST",
+        help="List as sha256sum writes it; each tile is compared with it when it is read.",
+    ),
 )
 
 filter_options = stack(

@@ -73,7 +73,7 @@ def proof(tiles: tuple[Path, ...], sizes: tuple[float, ...], profile: str, repea
 
     \b
     ppdf-dask benchmark proof tile.laz
-    ppdf-dask benchmark proof DIR/40M/tiles --chunk-size 150
+    ppdf-dask benchmark proof DIR/tiles --chunk-size 150
     """
     from ppdf_dask.experiments import proof as study
     from ppdf_dask.survey import scan

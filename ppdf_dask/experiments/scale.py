@@ -65,12 +65,12 @@ def extent_of(points: float) -> tuple[float, float, float, float]:
 def make_survey(
     client: Client, folder: Path, extent: tuple[float, float, float, float], tile: int = TILE
 ) -> list[Path]:
-    """Generate a survey's tiles on the workers unless they are there already."""
+    """Generate a survey's tiles on the workers unless they are there: smaller surveys are parts of larger ones."""
     from ppdf_dask.synthetic.tiles import tile_rects
 
     made = [
-        client.submit(_make_tile, str(folder), rect, key=f"generate-{folder.name}-{k}")
-        for k, rect in enumerate(tile_rects(extent, tile))
+        client.submit(_make_tile, str(folder), rect, key=f"generate-{folder.name}-{rect.x0}-{rect.y0}")
+        for rect in tile_rects(extent, tile)
     ]
     return [Path(path) for path in client.gather(made)]
 
@@ -349,7 +349,7 @@ def study(sizes: list[float], workers: list[int], folder: Path, params: RunParam
     # By workers of their own: what generating leaves in a process would count as memory of the job.
     with cluster(max(workers)) as (client, _):
         warm = make_survey(client, folder / "warm", WARM_UP, 125)
-        tiles = {points: make_survey(client, place, extent_of(points)) for points, place in places.items()}
+        tiles = {points: make_survey(client, folder, extent_of(points)) for points in sizes}
     rows = []
     for count in workers:
         with cluster(count) as (client, pids):
