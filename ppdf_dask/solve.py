@@ -40,6 +40,9 @@ class ClassifyJob:
         First guess and limit of the buffer, mm.
     most_points : float
         Points a cloud may have; default: any number.
+    usual_points : float
+        Points above which a cloud with a wider buffer is cut where that helps, though there is memory for more: else
+        the peak of a large survey would be that of its worst place. Default: any number.
     """
 
     chunk: Chunk
@@ -48,6 +51,7 @@ class ClassifyJob:
     buffer: int
     max_buffer: int
     most_points: float = float("inf")
+    usual_points: float = float("inf")
 
 
 @dataclass(frozen=True)
@@ -114,11 +118,14 @@ def solve(store: RunStore, job: ClassifyJob) -> Answer:
     todo, loaded, first, widest, full = [(job.chunk.core, job.buffer)], [], 0, job.buffer, False
     while todo:
         part, width = todo.pop()
-        if near.expect(part, width) > job.most_points:
+        expected = near.expect(part, width)
+        if expected > (job.most_points if width == job.buffer else min(job.most_points, job.usual_points)):
             parts = quarters(part, width)
-            if parts or width > job.buffer:
-                todo += [(p, width) for p in parts]
-                full |= not parts
+            todo += [(p, width) for p in parts]
+            if parts:
+                continue
+            if width > job.buffer and expected > job.most_points:
+                full = True
                 continue
         cloud, index = near.cloud(part, width)
         widest = max(widest, width)

@@ -32,6 +32,9 @@ from ppdf_dask.tiler import TileJob, unpack_cells
 
 Records = dict[str, dict[str, Any]]
 
+SMALL = 2_000_000
+"""Points of a cloud that take so little memory that cutting it for that would be a waste of time."""
+
 
 @dataclass(frozen=True)
 class Waiting:
@@ -204,7 +207,14 @@ class Cutting:
     def classify_job(self, chunk: str) -> ClassifyJob:
         """Return what a worker needs to classify a chunk."""
         p = self.inputs.plan
-        return ClassifyJob(p.grid.parse(chunk), self.cut, self.filter, self.buffer, self.widest, p.most_points)
+        return ClassifyJob(
+            p.grid.parse(chunk), self.cut, self.filter, self.buffer, self.widest, p.most_points, self.usual_points
+        )
+
+    @cached_property
+    def usual_points(self) -> float:
+        """Points above which a cloud with a wider buffer is cut: those of the largest cloud with the first guess."""
+        return float(max(SMALL, *(self.index.loaded(chunk) for chunk in self.index.chunks)))
 
     def classify_works(self) -> list[Work]:
         """Return the work of the classify stage, densest chunk first."""

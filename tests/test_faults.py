@@ -205,8 +205,9 @@ TABLE: dict[str, tuple[str, list[str] | str]] = {
         ],
     ),
     "F34": (
-        "a stopped worker, a late writer",
+        "a stopped, a cut off, a slow worker, a late writer",
         [
+            "faults_cluster::f34_a_cut_network_and_a_worker_twenty_times_slower",
             "faults_cluster::f30_f34_workers_are_killed_and_stopped_in_each_stage",
             "faults_kill::f39_f34_work_that_runs_twice_at_once_does_no_harm",
         ],

@@ -10,9 +10,10 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
@@ -298,23 +299,35 @@ def test_f35_no_room_to_spill(tiles, expected, tmp_path):
         assert outputs(out) == expected
 
 
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
 @contextmanager
-def scheduler(folder: Path, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a scheduler and a worker of their own."""
+def scheduler(folder: Path, port: int, workers: Iterable[tuple[int, float]] = ()) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a scheduler and workers of their own.
+
+    `workers`: the port each one finds the scheduler at, and how many seconds its work takes longer; default: one.
+    """
     environment = os.environ | {
         "DASK_DISTRIBUTED__WORKER__PRELOAD": json.dumps([str(HERE / "slow_preload.py")]),
-        "FAULTY_SLEEP": "0.4",
+        "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "5s",
         "PYTHONWARNINGS": "ignore",
     }
     said = (folder / "dask.log").open("ab")
     dask = [sys.executable, "-m", "dask"]
     host = ["--host", "127.0.0.1"]
     alone = ["--no-dashboard", "--nthreads", "1", "--death-timeout", "20", "--local-directory", str(folder)]
-    commands = (
-        [*dask, "scheduler", *host, "--port", str(port), "--no-dashboard"],
-        [*dask, "worker", f"tcp://127.0.0.1:{port}", *host, *alone],
-    )
-    started = [subprocess.Popen(c, env=environment, stdout=said, stderr=said) for c in commands]
+    commands = [([*dask, "scheduler", *host, "--port", str(port), "--no-dashboard"], 0.0)]
+    for at, sleep in workers or [(port, 0.4)]:
+        commands.append(([*dask, "worker", f"tcp://127.0.0.1:{at}", *host, *alone, "--name", f"at-{at}"], sleep))
+    started = [
+        subprocess.Popen(c, env=environment | {"FAULTY_SLEEP": str(sleep)}, stdout=said, stderr=said)
+        for c, sleep in commands
+    ]
     try:
         yield started[0]
     finally:
@@ -324,14 +337,72 @@ def scheduler(folder: Path, port: int) -> Iterator[subprocess.Popen[bytes]]:
         said.close()
 
 
+class Link:
+    """A way to a port that can be cut as a network is: nobody is told, what is sent does not arrive."""
+
+    def __init__(self, port: int) -> None:
+        self._port, self._open = port, threading.Event()
+        self._open.set()
+        self._threads: list[threading.Thread] = []
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self._start(self._accept)
+
+    def cut(self) -> None:
+        self._open.clear()
+
+    def end(self) -> None:
+        self._open.set()
+        self._listener.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join(10)
+        self._listener.close()
+
+    def _start(self, call: Callable[..., None], *arguments: socket.socket) -> None:
+        self._threads.append(threading.Thread(target=call, args=arguments, daemon=True))
+        self._threads[-1].start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near = self._listener.accept()[0]
+                far = socket.create_connection(("127.0.0.1", self._port))
+            except OSError:
+                return
+            self._start(self._pump, near, far)
+            self._start(self._pump, far, near)
+
+    def _pump(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(1 << 16):
+                self._open.wait()
+                target.sendall(data)
+        with suppress(OSError):
+            target.shutdown(socket.SHUT_RDWR)
+        source.close()
+
+
+def test_f34_a_cut_network_and_a_worker_twenty_times_slower(tiles, expected, tmp_path):
+    """The work of the worker that cannot be heard is given to others; what it still writes does no harm."""
+    out, port = tmp_path / "run", free_port()
+    link = Link(port)
+    try:
+        with scheduler(tmp_path, port, [(port, 0.2), (port, 4.0), (link.port, 3.0)]):
+            command = Command(tiles, out, "--scheduler", f"tcp://127.0.0.1:{port}")
+            command.wait_for("tile")
+            link.cut()
+            code, said = command.end()
+    finally:
+        link.end()
+    assert code == 0, said
+    assert outputs(out) == expected
+
+
 @pytest.mark.parametrize(
     "stage", ["classify", *(pytest.param(s, marks=pytest.mark.slow) for s in STAGES if s != "classify")]
 )
 def test_f31_a_lost_scheduler_is_named_and_a_new_one_goes_on(tiles, expected, tmp_path, stage):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    out = tmp_path / "run"
+    out, port = tmp_path / "run", free_port()
     with scheduler(tmp_path, port) as process:
         command = Command(tiles, out, "--scheduler", f"tcp://127.0.0.1:{port}")
         command.wait_for(stage)

@@ -92,7 +92,7 @@ def check(folder: Path, name: str, place: tuple[int, int], shape: tuple[int, int
     np.random.default_rng(how["order"]).shuffle(ids)
     for ident in ids:
         chunk = cut.grid.parse(ident)
-        job = ClassifyJob(chunk, cut, FILTERS[name], round(how["buffer"] * 1000), FAR, how["most"])
+        job = ClassifyJob(chunk, cut, FILTERS[name], round(how["buffer"] * 1000), FAR, how["most"], how["usual"])
         record = tasks.classify(store.url, job, "f")
         assert record["unproven"] == 0
     np.testing.assert_array_equal(masks(store, jobs), survey.whole(name))
@@ -103,6 +103,7 @@ ways = {
     "tile": st.sampled_from([30, 50, 200]),
     "buffer": st.sampled_from([0.0, 8.0, 25.0, 120.0]),
     "order": st.integers(0, 9),
+    "usual": st.sampled_from([float("inf"), 2000.0]),
 }
 quiet = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large]}
 
@@ -140,6 +141,23 @@ def test_a_chunk_too_dense_for_its_memory_is_worked_on_in_quarters_with_the_same
     assert max(cautious.loaded) < 1.2 * 25_000  # Expected from the index, as if points were spread evenly.
     assert not cautious.unproven.any()
     np.testing.assert_array_equal(cautious.ground, whole.ground)
+
+
+def test_a_wider_buffer_loads_no_more_than_is_usual_where_cutting_helps_and_is_never_given_up_for_it(tmp_path):
+    survey = Survey(tmp_path, (0, 0, 240, 240), 240)
+    store, _, cut, ids = survey.cut("robust", 80.0, 5.0)
+    modest = FILTERS["robust"].replace(search_radius=5.0, passes=2, fine_passes=1, largest_building=10.0)
+    most = {}
+    for usual in (float("inf"), 25_000.0, 12_000.0):
+        answers = [
+            solve(store, ClassifyJob(cut.grid.parse(i), cut, modest, 5000, FAR, float("inf"), usual)) for i in ids
+        ]
+        assert not any(a.full or a.unproven.any() for a in answers)
+        most[usual] = max(max(a.loaded) for a in answers), np.concatenate([a.ground for a in answers])
+    assert most[25_000.0][0] < 1.2 * 25_000 < most[float("inf")][0]
+    assert most[12_000.0][0] > 1.2 * 12_000
+    for _, ground in most.values():
+        np.testing.assert_array_equal(ground, most[float("inf")][1])
 
 
 def test_what_cannot_be_proven_in_the_memory_is_said(tmp_path):
