@@ -34,6 +34,9 @@ WINDOW_PER_THREAD = 3
 POLL = 1.0
 """Seconds between two looks at scheduler and lock while no result comes."""
 
+PATIENCE = 15.0
+"""Seconds without any worker after which the user hears of it: more than a worker takes to be started again."""
+
 
 @dataclass(frozen=True)
 class Work:
@@ -93,6 +96,7 @@ class _Flight:
     suspects: list[Work] = field(default_factory=list)
     room: int = 0
     asked: float = float("-inf")
+    alone: float | None = None
     address: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -116,9 +120,23 @@ class _Flight:
         now = time.monotonic()
         if now >= self.asked + POLL:
             with self._cluster_faults(None):
-                self.room = max(4, WINDOW_PER_THREAD * sum(self.client.nthreads().values()))
-            self.asked = now
+                threads = sum(self.client.nthreads().values())
+            self.room, self.asked = max(4, WINDOW_PER_THREAD * threads), now
+            self._say_when_alone(threads, now)
         return self.room
+
+    def _say_when_alone(self, threads: int, now: float) -> None:
+        if threads:
+            self.alone = None
+        elif self.alone is None:
+            self.alone = now
+        elif now >= self.alone + PATIENCE:
+            self.alone = float("inf")
+            warning = (
+                f"the scheduler at {self.address} has had no worker for {PATIENCE:g} s; the run goes on as soon as one "
+                "comes. Ctrl-C ends it and nothing is lost"
+            )
+            self.on_event(Event(self.stage.name, "noted", record={"warning": warning}))
 
     def land(self) -> tuple[Work, dict[str, Any] | Failure] | None:
         """Wait for one piece; return its record or failure, None when it is to fly again."""
@@ -130,6 +148,7 @@ class _Flight:
                 self.check()
                 if self.client.status != "running":
                     raise self._lost(None) from None
+                self.window()
         work, _ = self.flying.pop(str(future.key))
         if future.status not in ("finished", "error"):
             raise self._lost(work)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import dask
 import pytest
 from distributed import Client, LocalCluster, Security
 
-from ppdf_dask import cluster, preflight
+from ppdf_dask import cluster, execute, preflight
 from ppdf_dask.cluster import check_address, connect, dashboard
 from ppdf_dask.errors import ClusterError
 from ppdf_dask.params import ChunkParams, RunParams
@@ -250,6 +251,26 @@ def test_a_cluster_without_workers_is_said_so(made):
             preflight.check(client, made, wait=0.2)
         with pytest.raises(ClusterError, match="has no worker"):
             preflight.worker_memory(client, wait=0.2)
+
+
+def test_a_cluster_that_lost_all_its_workers_is_said_so_and_waited_for(monkeypatch):
+    monkeypatch.setattr(execute, "PATIENCE", 0.2)
+    heard = []
+    with (
+        LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as empty,
+        Client(empty) as client,
+    ):
+
+        def hear(event):
+            heard.append(event.record.get("warning", ""))
+            if event.state == "noted":
+                empty.scale(1)
+
+        stage = execute.Stage("tile", lambda url, job, fingerprint: {"job": job}, "", "t")
+        work = execute.Work("s_000000", 1, 7, "")
+        assert list(execute.execute(client, stage, [work], hear)) == [(work, {"job": 7})]
+    (said,) = [text for text in heard if text]
+    assert re.fullmatch(r"the scheduler at \S+ has had no worker for 0.2 s; the run goes on as soon .*", said)
 
 
 def test_closing_the_cluster_under_a_run_is_named(made):

@@ -89,9 +89,12 @@ def chosen(filter_name: str, profile: str | None, changes: Sequence[str] = ()) -
     --------
     >>> chosen("ppdf", None, ["tolerance=0.3"]).tolerance
     0.3
+    >>> chosen("ppdf", None, ["steps=planes,growth"]).steps
+    ('planes', 'growth')
     """
     from ppdf_dask import filters
 
+    base = filters.parameters(filter_name, profile)
     values: dict[str, Any] = {}
     for change in changes:
         name, sign, text = change.partition("=")
@@ -100,8 +103,9 @@ def chosen(filter_name: str, profile: str | None, changes: Sequence[str] = ()) -
         try:
             values[name.strip()] = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
-            values[name.strip()] = text.strip()
-    return filters.parameters(filter_name, profile).replace(**values)
+            listed = isinstance(getattr(base, name.strip(), None), tuple)
+            values[name.strip()] = tuple(part.strip() for part in text.split(",")) if listed else text.strip()
+    return base.replace(**values)
 
 
 def tracked(items: Sequence[T], title: str) -> Iterator[T]:
