@@ -14,7 +14,7 @@ from ppdf_dask.ledger import Stage as StageName
 from ppdf_dask.lock import holder
 from ppdf_dask.quarantine import read_failures
 from ppdf_dask.raster import rasterize
-from ppdf_dask.saved import load_plan
+from ppdf_dask.saved import load_plan, other_code, refuse_other_code
 from ppdf_dask.solve import solve
 from ppdf_dask.stages import Cutting, Inputs
 from ppdf_dask.store import RunStore
@@ -35,7 +35,7 @@ def status(out: str | Path) -> dict[str, Any]:
     dict
         ``stages`` (name to ``tasks``, None where not known yet, and ``done``), ``running`` (who works there, or None),
         ``submitted`` (the state of a run that lives in a cluster, see `Submission.state`, or None), ``failures`` and
-        ``waiting`` as in ``failures.json``, ``finished``.
+        ``waiting`` as in ``failures.json``, ``finished``, ``other_code`` (what made the run, unless this code did).
 
     Raises
     ------
@@ -48,7 +48,7 @@ def status(out: str | Path) -> dict[str, Any]:
     store = RunStore(str(Path(out) / "run.zarr"))
     if sent is not None and not store.exists():
         known["tile"] = sum(t.point_count > 0 for t in sent.plan().survey.tiles)
-        return _answer(known, done, sent, None, {"failures": [], "waiting": []}, False)
+        return _answer(known, done, sent, None, {"failures": [], "waiting": []}, False, None)
     plan = load_plan(out)
     inputs, ledger = Inputs(plan), Ledger(store)
     tiles = ledger.done("tile", inputs.tile_keys)
@@ -71,7 +71,7 @@ def status(out: str | Path) -> dict[str, Any]:
             known["dtm"], done["dtm"] = len(blocks[0]) + len(blocks[1]), len(found)
             export = cutting.cog_work(blocks[0], blocks[1])
             known["cog"], done["cog"] = 1, len(ledger.done("cog", {"dtm.tif": export.fingerprint}))
-    return _answer(known, done, sent, holder(store), lost, (plan.out / "run.json").is_file())
+    return _answer(known, done, sent, holder(store), lost, (plan.out / "run.json").is_file(), other_code(out))
 
 
 def _submitted(out: str | Path) -> Submission | None:
@@ -88,11 +88,13 @@ def _answer(
     running: str | None,
     lost: dict[str, Any],
     finished: bool,
+    other: str | None,
 ) -> dict[str, Any]:
     return {
         "stages": {stage: {"tasks": known[stage], "done": done[stage]} for stage in STAGES},
         "running": running,
         "submitted": None if sent is None else sent.state(),
+        "other_code": other,
         **lost,
         "finished": finished,
     }
@@ -117,8 +119,11 @@ def replay(out: str | Path, piece: str) -> dict[str, Any]:
     ------
     ParameterError
         When there is no such piece.
+    StoreError
+        When there is no run, or other code made it.
     """
     plan = load_plan(out)
+    refuse_other_code(out)
     store = RunStore(str(plan.out / "run.zarr"))
     inputs = Inputs(plan)
     cutting = Cutting(inputs, store, Ledger(store).done("tile", inputs.tile_keys))

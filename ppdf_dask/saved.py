@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ppdf_dask import filters
+from ppdf_dask import __version__, codeprint, filters
 from ppdf_dask.errors import PpdfError, StoreError
 from ppdf_dask.grid import ChunkGrid
 from ppdf_dask.params import ChunkParams, ClassRules, DtmParams, RunParams
@@ -39,6 +39,34 @@ def load_plan(out: str | Path) -> Plan:
         f"the plan of {out} is missing or damaged; give the `ppdf-dask run TILES --out {out}` command again, which "
         "restores it"
     )
+
+
+def other_code(out: str | Path) -> str | None:
+    """Say by what a run was made when that is not the code at hand; None when it is.
+
+    Fingerprints hold the code, so that no record of such a run counts for this one.
+    """
+    facts = RunStore(str(Path(out) / "run.zarr")).attributes().get("facts", {})
+    then, now = (facts.get("version"), facts.get("code")), (__version__, codeprint.code())
+    if not facts or then == now:
+        return None
+    return f"ppdf_dask {then[0]} (code {then[1]}), here is {now[0]} (code {now[1]})"
+
+
+def refuse_other_code(out: str | Path) -> None:
+    """Refuse to judge a run that other code made.
+
+    Raises
+    ------
+    StoreError
+        Naming both.
+    """
+    made = other_code(out)
+    if made is not None:
+        raise StoreError(
+            f"{out} was made by {made}: look at it with the version that made it, or make it anew with "
+            "`ppdf-dask run ... --accept-changes`"
+        )
 
 
 def plan_as_dict(plan: Plan) -> dict[str, Any]:

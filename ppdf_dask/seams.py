@@ -22,7 +22,7 @@ from ppdf_dask.filters.cloud import Cloud
 from ppdf_dask.grid import MM, Chunk, Rect
 from ppdf_dask.index import fragments
 from ppdf_dask.neighbourhood import crop, inside, join, overlap
-from ppdf_dask.saved import load_plan
+from ppdf_dask.saved import load_plan, refuse_other_code
 from ppdf_dask.solve import NARROW, ClassifyJob
 from ppdf_dask.stages import Cutting, Inputs
 from ppdf_dask.store import RunStore
@@ -133,7 +133,8 @@ class Seams:
         axes.ticklabel_format(useOffset=False, style="plain")
         axes.tick_params(axis="x", rotation=30)
         share = self.differ / max(self.points, 1)
-        axes.set_title(f"{self.filter}, buffer {self.buffer_m:g} m: {share:.3%} of the seams' points differ")
+        # Above the colour bar too: the map itself may be narrower than the title.
+        figure.suptitle(f"{self.filter}, buffer {self.buffer_m:g} m: {share:.3%} of the seams' points differ", size=11)
         figure.colorbar(lines, label="points with two answers (%)")
         return figure
 
@@ -151,9 +152,10 @@ def measure(run: str | Path, tick: Tick = lambda chunk: None) -> Seams:
     Raises
     ------
     StoreError
-        When there is no run, or its points are gone (``--drop-intermediate``).
+        When there is no run, other code made it, or its points are gone (``--drop-intermediate``).
     """
     store, plan = RunStore(str(Path(run) / "run.zarr")), load_plan(run)
+    refuse_other_code(run)
     inputs = Inputs(plan)
     keys = inputs.tile_keys
     tiles = {s: r for s, r in store.records("tile") if s in keys and r["fingerprint"] == keys[s]}

@@ -23,7 +23,7 @@ from ppdf_dask.merge import class_counts, crc32_of
 from ppdf_dask.objects import LEFTOVER
 from ppdf_dask.raster import checksum
 from ppdf_dask.repair import leftovers, maker, note
-from ppdf_dask.saved import load_plan
+from ppdf_dask.saved import load_plan, refuse_other_code
 from ppdf_dask.stages import Cutting, Inputs, Records
 from ppdf_dask.store import RunStore, record_path
 
@@ -110,9 +110,10 @@ def verify(out: str | Path, *, leave_note: bool = True) -> Report:
     Raises
     ------
     StoreError
-        When there is no run, or not even its plan can be read.
+        When there is no run, not even its plan can be read, or other code made it.
     """
     plan = load_plan(out)
+    refuse_other_code(out)
     store = RunStore(str(plan.out / "run.zarr"))
     check = _Check(Inputs(plan), store)
     check.report.running = holder(store)

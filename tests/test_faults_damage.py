@@ -416,6 +416,19 @@ def test_f38_changed_inputs_and_versions_are_refused_side_by_side(tiles, run, mo
     assert verify(run).findings == []
 
 
+def test_f38_a_run_of_other_code_is_named_and_not_called_damaged(run, monkeypatch):
+    from ppdf_dask.care import replay, status
+    from ppdf_dask.seams import measure
+
+    assert status(run)["other_code"] is None
+    monkeypatch.setattr("ppdf_dask.codeprint.code", lambda: "0123456789ab")
+    for look in (verify, measure, lambda out: replay(out, "s_000000")):
+        with pytest.raises(StoreError, match=r"was made by ppdf_dask .*here is .*0123456789ab.*--accept-changes"):
+            look(run)
+    assert "0123456789ab" in status(run)["other_code"]
+    assert not (run / "damage.json").exists()
+
+
 def test_f24_f22_no_run_over_its_inputs_or_out_of_its_folder(tiles, tmp_path):
     shutil.copytree(tiles, tmp_path / "laz")
     with pytest.raises(SurveyError, match="inputs are never written to"):

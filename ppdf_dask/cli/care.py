@@ -29,6 +29,8 @@ def status(run: Path, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(found, indent=1))
         return
+    if found["other_code"]:
+        click.echo(f"made by    {found['other_code']}: none of its work counts for this version")
     for name, s in found["stages"].items():
         click.echo(f"{name:<10} {s['done']:>8} of {s['tasks'] if s['tasks'] is not None else '?'} done")
     click.echo(f"running    {found['running'] or 'nobody'}")
