@@ -389,7 +389,8 @@ class Link:
         source.close()
 
 
-@pytest.mark.parametrize("nanny", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("nanny", [False, True])
 def test_f34_a_cut_network_and_a_worker_twenty_times_slower(tiles, expected, tmp_path, nanny):
     """The work of the worker that cannot be heard is given to others; what it still writes does no harm.
 
