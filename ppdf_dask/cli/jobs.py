@@ -103,7 +103,7 @@ def run(
     cluster = {k: options.pop(k) for k in ("workers", "scheduler", "insecure", "quiet", "json_log")}
     params = run_params(options)
     memory = _memory(cluster)
-    made = make_plan(_scan(tiles, options), params, out=out, memory=memory)
+    made = make_plan(_scan(tiles, options, quiet=cluster["quiet"]), params, out=out, memory=memory)
     made.check()
     if not cluster["quiet"]:
         click.echo(repr(made), err=True)
@@ -168,10 +168,13 @@ def classify(source: Path, target: Path, **options: Any) -> None:
     click.echo(f"{target}: {counts['points']:,} points, {counts['ground']:,} ground ({share:.1%})")
 
 
-def _scan(tiles: tuple[str, ...], options: dict[str, Any]) -> Survey:
+def _scan(tiles: tuple[str, ...], options: dict[str, Any], *, quiet: bool = False) -> Survey:
+    from rich.console import Console
+
     from ppdf_dask.survey import scan as scan_tiles
 
-    survey = scan_tiles(list(tiles), **options)
+    with Console(stderr=True, quiet=quiet).status("reading headers"):
+        survey = scan_tiles(list(tiles), **options)
     for problem in survey.problems:
         click.echo(f"{problem.path}: {problem.message}", err=True)
     return survey
