@@ -17,6 +17,12 @@ _TILE = re.compile(r".*\.la[sz]", re.IGNORECASE)
 _MOST = 64 << 20  # bytes: about half a million tiles
 
 
+def sha256_of(path: str) -> str:
+    """Return the SHA-256 of a file, 64 hexadecimal digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def with_checksums(tiles: Sequence[Tile], path: str | os.PathLike[str]) -> tuple[tuple[Tile, ...], list[Problem]]:
     """Give each tile the checksum that a list has for it.
 
@@ -82,8 +88,7 @@ def check_sha256(tile: Tile) -> None:
     if tile.sha256 is None:
         return
     try:
-        with open(tile.path, "rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
+        found = sha256_of(tile.path)
     except OSError as error:
         raise TileError(f"{shown(tile.path)} cannot be read: {error.strerror}") from None
     if found != tile.sha256:

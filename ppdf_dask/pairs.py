@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from ppdf_dask.checksums import sha256_of
 from ppdf_dask.errors import SurveyError, TileError
 from ppdf_dask.lasheader import Header
 from ppdf_dask.repeats import PAIRS, SHARE, share_of_same_points
@@ -48,8 +48,7 @@ def find_duplicates(headers: Mapping[str, Header]) -> list[list[str]]:
 
 def _digest(path: str) -> str:
     try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return sha256_of(path)
     except OSError as error:
         raise SurveyError(f"{shown(path)} cannot be read: {error.strerror}") from None
 

@@ -149,14 +149,14 @@ class _Run:
         self.tiles = self._stage("tile", tasks.tile, self.inputs.tile_works())
         sources, unit = self.inputs.sources, self.plan.survey.unit_xy
         self.odd = []
-        self._note([p for s, record in self.tiles.items() for p in oddities(sources[s], record, unit)])
+        self._note("tile", [p for s, record in self.tiles.items() for p in oddities(sources[s], record, unit)])
         self.cutting = Cutting(self.inputs, self.store, self.tiles)
         self.cutting.index.publish(self.store)
 
-    def _note(self, odd: list[Problem]) -> None:
+    def _note(self, stage: StageName, odd: list[Problem]) -> None:
         self.odd += odd
         for line in in_short(odd):
-            self.on_event(Event("tile", "noted", record={"warning": line}))
+            self.on_event(Event(stage, "noted", record={"warning": line}))
 
     def density(self) -> Density:
         """Return points and occupied cells of the survey."""
@@ -169,8 +169,8 @@ class _Run:
             "classify", tasks.classify, works, lambda _, record: self.cutting.still_proven(record)
         )
         looked_at = {source: record["eligible"] for source, record in self.tiles.items()}
-        shared = list(shared_problems(self.inputs.sources, looked_at, [r["shared"] for r in self.chunks.values()]))
-        self._note(shared)
+        found = shared_problems(self.inputs.sources, looked_at, (r["shared"] for r in self.chunks.values()))
+        self._note("classify", list(found))
 
     def merge(self) -> None:
         """Write each source file again, classified."""

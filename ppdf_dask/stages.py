@@ -68,7 +68,7 @@ class Inputs:
         return {
             "version": __version__,
             "code": code(),
-            "inputs": {t.name: [t.path, t.size, t.mtime_ns, *filter(None, [t.sha256])] for t in self.sources.values()},
+            "inputs": {t.name: [t.path, t.size, t.mtime_ns, t.sha256] for t in self.sources.values()},
             "crs": p.survey.crs,
             "units": [p.survey.unit_xy, p.survey.unit_z],
             "params": p.params.as_dict(),

@@ -203,30 +203,10 @@ def scan(
     names, problems = output_names(files, root)
     repeated = sorted({a for a, b in pairwise(files) if a == b})
 
-    headers: dict[str, Header] = {}
-    frames: dict[str, Frame] = {}
-    boxes: dict[str, Any] = {}
-    for path in names:
-        try:
-            header = read_header(path)
-        except Reject as reject:
-            boxes[path] = reject.box
-            problems.append(Problem(path, reject.code, reject.message, True))
-            continue
-        problems += [Problem(path, code, message, False) for code, message in header.warnings]
-        frames[path] = frame_of(header, assumed)
-        boxes[path] = header.mins, header.maxs
-        # The records' own bytes would be most of the memory of a large survey.
-        headers[path] = replace(header, wkt=None, geo_keys=None)
-    for path, frame in frames.items():
-        fault = frame.fault
-        if fault is not None and not (units is not None and fault[0] in ("crs-unreadable", "units")):
-            problems.append(Problem(path, fault[0], fault[1] + remedy(fault[0]), True))
+    good, frames, boxes, notes = _read_headers(names, assumed, units)
+    problems += notes
     _refuse(problems, skip_bad)
-    bad = {p.path for p in problems if p.fatal}
-    good = {path: h for path, h in headers.items() if path not in bad}
-
-    reference, notes = common_frame({path: frames[path] for path in good}, units)
+    reference, notes = common_frame(frames, units)
     problems += notes
     twins = find_duplicates(good)
     problems += duplicate_problems(repeated, twins, duplicates)
@@ -259,6 +239,33 @@ def scan(
     if duplicates != "keep":
         refuse_same_points(found.tiles, found.overlaps, found.unit_xy, found.unit_z)
     return found
+
+
+def _read_headers(
+    paths: Iterable[str], assumed: Frame | None, units: float | None
+) -> tuple[dict[str, Header], dict[str, Frame], dict[str, Any], list[Problem]]:
+    """Return headers and frames of the files that can be used, the box that each file gives, and what is wrong."""
+    headers: dict[str, Header] = {}
+    frames: dict[str, Frame] = {}
+    boxes: dict[str, Any] = {}
+    problems: list[Problem] = []
+    for path in paths:
+        try:
+            header = read_header(path)
+        except Reject as reject:
+            boxes[path] = reject.box
+            problems.append(Problem(path, reject.code, reject.message, True))
+            continue
+        boxes[path] = header.mins, header.maxs
+        problems += [Problem(path, code, message, False) for code, message in header.warnings]
+        frame = frame_of(header, assumed)
+        if frame.fault is not None and not (units is not None and frame.fault[0] in ("crs-unreadable", "units")):
+            problems.append(Problem(path, frame.fault[0], frame.fault[1] + remedy(frame.fault[0]), True))
+            continue
+        frames[path] = frame
+        # The records' own bytes would be most of the memory of a large survey.
+        headers[path] = replace(header, wkt=None, geo_keys=None)
+    return headers, frames, boxes, problems
 
 
 def _placed(problem: Problem, box: Any, frame: Frame) -> Problem:
