@@ -17,13 +17,14 @@ def classify(points, params):
     steps = params.steps
     low, removed = lows(points, c, "outliers" in steps)
     radius = round(params.search_radius * 1000)
-    refs, soft, roofs = set(), set(), set()
+    refs, soft, roofs, high = set(), set(), set(), set()
     if "planes" in steps:
         refs, soft, roofs = seeds(low, c, params)
     if "growth" in steps:
         rule = (params.growth_base, params.growth_spread, params.growth_slope, params.growth_step, 1.5)
         for _ in range(params.passes):
-            refs = refs | grow(low, refs, soft, roofs, c, radius, rule, lambda cell: 0.0)
+            new, high = grow(low, refs, soft, roofs, c, radius, rule, lambda cell: 0.0)
+            refs = refs | new
     refs, residual = clean(low, refs, c, radius, "cleaning" in steps)
     rough = {cell: roughness(cell, residual) for cell in {(x // c, y // c) for x, y, _ in points}}
     coarse_low, size = low, c
@@ -38,11 +39,13 @@ def classify(points, params):
         refs = {cell for cell in fine if is_low[cell] and coarse(cell) in refs}
         soft = {cell for cell in fine if coarse(cell) in soft}
         roofs = {cell for cell in fine if coarse(cell) in roofs}
+        high = {cell for cell in fine if coarse(cell) in high}
         low = fine
         rule = (params.fine_base, params.fine_spread, params.fine_slope, params.fine_step, 2.0)
         for _ in range(params.fine_passes):
             slack = lambda cell: params.fine_roughness * (rough[coarse(cell)] * 1e-3)  # noqa: E731
-            refs = refs | grow(low, refs, soft, roofs, size, radius, rule, slack)
+            new, more = grow(low, refs, soft, roofs | high, size, radius, rule, slack)
+            refs, high = refs | new, high | more
     return [
         label(
             p,
@@ -53,7 +56,7 @@ def classify(points, params):
             params=params,
             removed=removed,
             rough=rough[p[0] // c, p[1] // c],
-            empty=(p[0] // c, p[1] // c) not in coarse_low,
+            empty=(p[0] // c, p[1] // c) not in coarse_low or (p[0] // size, p[1] // size) in high - refs,
         )
         for p in points
     ]
@@ -286,17 +289,20 @@ def surface(p, low, refs, c, radius, own=None):
     return len(near), a * xm + b * ym - zm, slope, d, step
 
 
-def grow(low, refs, soft, roofs, c, radius, rule, slack):
+def grow(low, refs, soft, passed_over, c, radius, rule, slack):
+    """New references, and the cells whose low point is far above the others."""
     base, spread, factor, near, highest = rule
-    new = set()
-    for cell in low.keys() - refs - roofs:
+    new, high = set(), set()
+    for cell in low.keys() - refs - passed_over:
         n, r, slope, d, step = surface(low[cell], low, refs, c, radius, cell)
         rise = base + (spread + factor * slope) * d
         by_plane = -(8.0 + 0.15 * d) < r < min(highest, rise + slack(cell))
         by_step = r > 0.0 and step < near + spread * d and cell not in soft
         if n and (by_plane or by_step):
             new.add(cell)
-    return new
+        elif n >= 3 and r > 4.0 + slope * (c * 1e-3):
+            high.add(cell)
+    return new, high
 
 
 def clean(low, refs, c, radius, drop):

@@ -3,7 +3,7 @@
 import numpy as np
 import oracle_robust
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ppdf_dask.errors import ParameterError
@@ -58,6 +58,9 @@ seeds = st.integers(0, 2**32 - 1)
     params=st.sampled_from([SMALL, FINE]),
     steps=st.sampled_from([STEPS, *(tuple(s for s in STEPS if s != left_out) for left_out in STEPS)]),
 )
+# Rare: something near the ground in a cell whose lowest point is too high.
+@example(seed=61, snap=1, params=SMALL, steps=STEPS)
+@example(seed=1592, snap=1, params=FINE, steps=STEPS)
 def test_every_step_does_what_the_plain_oracle_does(seed, snap, params, steps):
     points = scene(seed, n=450, side=50.0, snap=snap)
     params = params.replace(steps=steps, largest_building=15.0)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from numba import njit
 
 from ppdf_dask.filters.cloud import Cloud
+from ppdf_dask.filters.ppdf.compiled import leaf
 
 SQUARE = 16
 """Cells along the edge of the largest plane square."""
@@ -34,6 +35,9 @@ FIXED = np.uint8(32)
 
 ROOF = np.uint8(64)
 """The low point belongs to a raised patch: never a reference."""
+
+HIGH = np.uint8(128)
+"""Nothing of the cell can be ground: its low point lies too far above the references around it."""
 
 OUTLIER_ROUNDS = 2
 OUTLIER_DEPTH = 1000
@@ -87,55 +91,49 @@ def _lowest(x: Any, y: Any, z: Any, fixed: Any, x0: Any, y0: Any, of_point: Any,
         state[k] = LOW | FIXED | REF if pin else LOW
 
 
+@leaf
+def _around(width: Any, pos: Any, state: Any, k: Any) -> Any:
+    """Return how many of the 24 cells around `k` have a low point, the third lowest, and whether one is not known."""
+    first = second = third = np.int64(1) << 40
+    n = 0
+    unknown = False
+    for dr in range(-2, 3):
+        for j in range(k + dr * width - 2, k + dr * width + 3):
+            if j == k:
+                continue
+            if state[j] & LOW:
+                n += 1
+                z = np.int64(pos[j, 2])
+                first, z = min(first, z), max(first, z)
+                second, z = min(second, z), max(second, z)
+                third = min(third, z)
+            elif state[j] & UNPROVEN:
+                unknown = True
+    return n, third, unknown
+
+
 @njit(nogil=True, cache=True)
-def _flag_outliers(width: Any, pos: Any, floor: Any, state: Any, limit: Any, again: Any) -> Any:
-    """Mark in `again` the cells whose low point goes (1) or cannot be judged (2); return how many go."""
-    low3 = np.empty(3, np.int64)
-    count = 0
+def _flag_outliers(width: Any, pos: Any, floor: Any, state: Any, limit: Any, again: Any) -> None:
+    """Mark in `again` the cells whose low point goes (1) or cannot be judged (2)."""
     for k in range(len(state)):
         again[k] = 0
-        s = state[k]
-        if not s & LOW or s & FIXED:
+        if not state[k] & LOW or state[k] & FIXED:
             continue
-        z = pos[k, 2]
-        n = 0
-        under = 0
-        unknown = False
-        low3[:] = 1 << 40
+        z = np.int64(pos[k, 2])
+        level = -1  # the point itself is counted too
         for dr in range(-2, 3):
-            base = k + dr * width
-            for j in range(base - 2, base + 3):
-                if j == k:
-                    continue
-                t = state[j]
-                if t & LOW:
-                    n += 1
-                    v = np.int64(pos[j, 2])
-                    if v < z + limit:
-                        under += 1
-                    if v < low3[2]:
-                        if v < low3[1]:
-                            low3[2] = low3[1]
-                            if v < low3[0]:
-                                low3[1] = low3[0]
-                                low3[0] = v
-                            else:
-                                low3[1] = v
-                        else:
-                            low3[2] = v
-                elif t & UNPROVEN:
-                    unknown = True
-            if under >= 3:
+            for j in range(k + dr * width - 2, k + dr * width + 3):
+                level += ((state[j] & LOW) != 0) & (pos[j, 2] < z + limit)
+            if level >= 3:
                 break
-        if under >= 3:
+        if level >= 3:
             continue
+        n, third, unknown = _around(width, pos, state, k)
         if unknown:
             again[k] = 2
         elif n >= 6:
             again[k] = 1
-            floor[k] = min(low3[2] - limit, z + limit)
-            count += 1
-    return count
+            floor[k] = min(third - limit, z + limit)
 
 
 @njit(nogil=True, cache=True)

@@ -180,6 +180,7 @@ def _grow(cells: Cells, params: RobustParams) -> npt.NDArray[np.uint8]:
             params.growth_step,
             params.growth_spread,
             1.5,
+            cells_.ROOF,
             NO_ROUGHNESS,
             0.0,
             0.0,
@@ -193,9 +194,9 @@ def _grow(cells: Cells, params: RobustParams) -> npt.NDArray[np.uint8]:
             index,
             after,
         )
+        state, after = after, state
         if not changed:
             break
-        state, after = after, state
     return state
 
 
@@ -279,6 +280,7 @@ def _grow_fine(
             params.fine_step,
             params.fine_spread,
             2.0,
+            cells_.ROOF | cells_.HIGH,
             rough,
             params.fine_roughness,
             ROUGH_MOST,

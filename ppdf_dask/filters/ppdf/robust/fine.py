@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from ppdf_dask.filters.ppdf.robust.cells import DROPPED, LOW, MAYBE_DROPPED, ROOF
+from ppdf_dask.filters.ppdf.robust.cells import DROPPED, HIGH, LOW, MAYBE_DROPPED, ROOF
 
 
 @njit(nogil=True, cache=True)
@@ -31,7 +31,7 @@ def halve(
     """
     half = cell // 2
     wide = 2 * width
-    fine_pos = np.zeros((wide * 2 * height, 3), np.int32)
+    fine_pos = np.empty((wide * 2 * height, 3), np.int32)
     fine = np.zeros(wide * 2 * height, np.uint8)
     for i in range(len(x)):
         k = of_point[i]
@@ -48,12 +48,13 @@ def halve(
         fine_pos[f, 0] = xi
         fine_pos[f, 1] = yi
         fine_pos[f, 2] = z[i]
-        fine[f] = LOW | (state[k] & (DROPPED | ROOF | MAYBE_DROPPED))
+        fine[f] = LOW | (state[k] & (DROPPED | ROOF | MAYBE_DROPPED | HIGH))
     for k in range(len(state)):
         if state[k] & LOW:
             f = pos[k, 1] // half * wide + pos[k, 0] // half
             fine[f] = state[k]
-            fine_pos[f] = pos[k]
+            for axis in range(3):  # assigning a slice would compile the text of its error too: two seconds
+                fine_pos[f, axis] = pos[k, axis]
         elif state[k]:
             f = k // width * 2 * wide + k % width * 2
             fine[f] = fine[f + 1] = fine[f + wide] = fine[f + wide + 1] = state[k]

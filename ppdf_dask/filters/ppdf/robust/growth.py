@@ -8,11 +8,16 @@ import numpy as np
 from numba import njit
 
 from ppdf_dask.filters.ppdf.compiled import leaf
-from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, ROOF, UNPROVEN
+from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, HIGH, LOW, MAYBE_DROPPED, REF, UNPROVEN
 from ppdf_dask.filters.ppdf.robust.surface import count_within, height_above, index_references, nearest, reach
 
 NOT_KNOWN = np.int32(-(2**31))
 """A residual or roughness that does not exist or is not proven."""
+
+TOO_HIGH = 4.0
+"""Metres above the surface of its references, and as much more as that rises in a cell, from where a low point is HIGH.
+
+A shortcut: what stands as high as a house is not tried again, and nor is what lies above it in its cell."""
 
 
 @leaf
@@ -45,6 +50,7 @@ def grow(
     step_limit: Any,
     step_spread: Any,
     highest: Any,
+    skip: Any,
     rough: Any,
     rough_factor: Any,
     rough_most: Any,
@@ -58,7 +64,9 @@ def grow(
     index: Any,
     after: Any,
 ) -> Any:
-    """Do one synchronous pass: `after` gets the new state; return how many states changed.
+    """Do one synchronous pass: `after` gets the new state; return how many changed by more than `HIGH`.
+
+    A low point with one of the flags `skip` is passed over.
 
     References are sought among `seek_state`, `rings` cells around: those of this grid, or of the coarser one with
     `fold` x `fold` cells in one, where only its low points are references yet and lie closer together, in cells.
@@ -76,7 +84,7 @@ def grow(
     for k in range(len(state)):
         s = state[k]
         after[k] = s
-        if not s & LOW or s & ROOF or s & (REF | UNPROVEN) == REF:
+        if not s & LOW or s & skip or s & (REF | UNPROVEN) == REF:
             continue
         if not first and count_within(news, width, k, np.int64(looked[k])) == 0:
             continue
@@ -97,20 +105,22 @@ def grow(
         by_plane = n > 0 and above and r < min(highest, rise + least)
         perhaps = n > 0 and above and r < min(highest, rise + most)
         by_step = n > 0 and r > 0.0 and step < step_limit + step_spread * d and not s & DROPPED
+        s &= ~HIGH
         if by_plane or by_step:
             s = (s | REF) & ~UNPROVEN
             if unknown or s & MAYBE_DROPPED:
                 s |= UNPROVEN
         elif unknown or perhaps:
             s |= UNPROVEN
-        if s != state[k]:
-            changed += 1
-            after[k] = s
+        elif not s & UNPROVEN and n >= 3 and r > TOO_HIGH + slope * (cell * 1e-3):
+            s |= HIGH
+        after[k] = s
+        changed += ((s ^ state[k]) & ~HIGH) != 0
     height = len(state) // width
     for row in range(height):
         total = 0
         for k in range(row * width, row * width + width):
-            total += state[k] != after[k]
+            total += ((state[k] ^ after[k]) & ~HIGH) != 0
             news[k] = total + (news[k - width] if row > 0 else 0)
     return changed
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
+from ppdf_dask.filters.ppdf.robust.cells import HIGH, LOW, REF, UNPROVEN
 from ppdf_dask.filters.ppdf.robust.growth import NOT_KNOWN
 from ppdf_dask.filters.ppdf.robust.surface import count_within, height_above, index_references, nearest, reach
 
@@ -70,7 +70,7 @@ def label(
             ground[i] = (state[k] & REF) != 0
             unproven[i] = (state[k] & UNPROVEN) != 0
             continue
-        if zi - pos[k, 2] >= 5000:
+        if zi - pos[k, 2] >= 5000 or state[k] & HIGH:
             continue
         fx, fy = xi % cell, yi % cell
         nearest(right, left, pos, width, cell, k, xi, yi, fx, fy, limit2, found)

@@ -48,7 +48,7 @@ def link_patches(
     open_: Any,
 ) -> None:
     """Unite patches whose planes agree; mark in `open_` the patches that touch something unproven."""
-    votes = np.zeros((count, 2), np.int32)
+    votes, agreeing = np.zeros(count, np.int64), np.zeros(count, np.int64)
     touched = np.empty(count, np.int64)
     for p in range(count):
         parent[p] = p
@@ -64,25 +64,25 @@ def link_patches(
                     for j in range(k + dr * width - near, k + dr * width + near + 1):
                         if state[j] & UNPROVEN or patch[j] == NOT_KNOWN_PATCH:
                             open_[p] = True
-                        q = patch[j]
+                        q = np.int64(patch[j])
                         if q <= p:
                             continue
-                        if votes[q, 0] == 0:
+                        if votes[q] == 0:
                             touched[n] = q
                             n += 1
-                        votes[q, 0] += 1
+                        votes[q] += 1
                         if (
                             abs(residual(planes, squares, p, pos, j, cell)) < agree
                             and abs(residual(planes, squares, q, pos, k, cell)) < agree
                         ):
-                            votes[q, 1] += 1
+                            agreeing[q] += 1
         for m in range(n):
             q = touched[m]
-            if 2 * votes[q, 1] >= votes[q, 0]:
+            if 2 * agreeing[q] >= votes[q]:
                 a, b = _root(parent, p), _root(parent, q)
                 parent[max(a, b)] = min(a, b)
-            votes[q, 0] = 0
-            votes[q, 1] = 0
+            votes[q] = 0
+            agreeing[q] = 0
     for p in range(count):
         parent[p] = _root(parent, p)
 
@@ -117,11 +117,12 @@ def judge_components(
     drops = np.zeros(count, np.int64)
     slow = np.zeros(count, np.int64)
     box = np.empty((count, 4), np.int64)
-    box[:, 0:2] = 1 << 40
-    box[:, 2:4] = -1
+    for root in range(count):
+        box[root, 0] = box[root, 1] = 1 << 40
+        box[root, 2] = box[root, 3] = -1
     shift = (1, -1, width, -width)
     for k in range(len(state)):
-        p = patch[k]
+        p = np.int64(patch[k])
         if p < 0:
             continue
         root = parent[p]
@@ -156,17 +157,17 @@ def judge_components(
                 drops[root] += falls and not steps
                 slow[root] += falls and steps
     verdict = np.zeros(count, np.uint8)
-    for p in range(count):
-        if parent[p] != p:
+    for root in range(count):
+        if parent[root] != root:
             continue
-        side = (max(box[p, 2] - box[p, 0], box[p, 3] - box[p, 1]) + 1) * cell
-        if open_[p]:
-            if side < largest or seeds[p] < smallest:
-                verdict[p] = UNPROVEN | MAYBE_DROPPED
-        elif seeds[p] < smallest:
-            verdict[p] = DROPPED
-        elif drops[p] + gentle * slow[p] > share * borders[p] and side < largest:
-            verdict[p] = ROOF
+        side = (max(box[root, 2] - box[root, 0], box[root, 3] - box[root, 1]) + 1) * cell
+        if open_[root]:
+            if side < largest or seeds[root] < smallest:
+                verdict[root] = UNPROVEN | MAYBE_DROPPED
+        elif seeds[root] < smallest:
+            verdict[root] = DROPPED
+        elif drops[root] + gentle * slow[root] > share * borders[root] and side < largest:
+            verdict[root] = ROOF
     for k in range(len(state)):
         if patch[k] >= 0 and not state[k] & FIXED:
             v = verdict[parent[patch[k]]]
@@ -189,7 +190,7 @@ def spread_roofs(
                 for j in range(k + dr * width - 1, k + dr * width + 2):
                     if state[j] & UNPROVEN:
                         mark[k] |= MAYBE_DROPPED
-                    if state[j] & ROOF and abs(residual(planes, squares, patch[j], pos, k, cell)) < agree:
+                    if state[j] & ROOF and abs(residual(planes, squares, np.int64(patch[j]), pos, k, cell)) < agree:
                         mark[k] |= ROOF
     for k in range(len(state)):
         state[k] |= mark[k]

@@ -40,10 +40,8 @@ def _fit(xs: Any, ys: Any, zs: Any, n: Any, seed: Any, trials: Any, t_in: Any, b
         score = 0
         for m in range(n):
             r = zs[m] - (h + a * xs[m] + b * ys[m])
-            if r < -limit:
-                score -= 1
-            elif r <= limit:
-                score += 1
+            # Without a branch the compiler takes several points at once.
+            score += int(r <= limit) - 2 * int(r < -limit)
         if score > best_score:
             best_score = score
             best[0], best[1], best[2] = a, b, h
@@ -95,8 +93,7 @@ def find_planes(
             while top:
                 top -= 1
                 c0, r0, size = stack[top, 0], stack[top, 1], stack[top, 2]
-                n = 0
-                base = np.int64(0)
+                n = base = np.int64(0)
                 for r in range(r0, r0 + size):
                     for k in range(r * width + c0, r * width + c0 + size):
                         if state[k] & LOW:
@@ -121,7 +118,7 @@ def find_planes(
                         inside += abs(r_m) <= t_in
                         deepest = min(deepest, r_m)
                     if inside >= 4 and inside >= share * n and deepest > -division:
-                        split = inside < 0.9 * n
+                        split = bool(inside < 0.9 * n)
                         taken = 0
                         for m in range(n):
                             k = who[m]

@@ -22,9 +22,7 @@ def local_roughness(width: Any, height: Any, state: Any, residuals: Any, reach: 
     first along rows, then along columns: exact, whatever the order.
     """
     n = len(state)
-    depth = np.zeros(n, np.int32)
-    number = np.zeros(n, np.int16)
-    open_ = np.zeros(n, np.int16)
+    depth, number, open_ = np.empty(n, np.int32), np.empty(n, np.int16), np.empty(n, np.int16)
     for row in range(height):
         start = row * width
         d = m = u = 0
@@ -46,24 +44,24 @@ def local_roughness(width: Any, height: Any, state: Any, residuals: Any, reach: 
                 depth[start + col - reach] = d
                 number[start + col - reach] = m
                 open_[start + col - reach] = u
-    sums = np.zeros((3, width), np.int64)
+    depths, numbers, opens = np.zeros(width, np.int64), np.zeros(width, np.int64), np.zeros(width, np.int64)
     for row in range(height + reach):
         for col in range(width):
             if row < height:
                 k = row * width + col
-                sums[0, col] += depth[k]
-                sums[1, col] += number[k]
-                sums[2, col] += open_[k]
+                depths[col] += depth[k]
+                numbers[col] += number[k]
+                opens[col] += open_[k]
             if row > 2 * reach:
                 k = (row - 2 * reach - 1) * width + col
-                sums[0, col] -= depth[k]
-                sums[1, col] -= number[k]
-                sums[2, col] -= open_[k]
+                depths[col] -= depth[k]
+                numbers[col] -= number[k]
+                opens[col] -= open_[k]
             if row >= reach:
                 k = (row - reach) * width + col
-                if sums[2, col] > 0:
+                if opens[col] > 0:
                     out[k] = NOT_KNOWN
-                elif sums[1, col] > 0:
-                    out[k] = sums[0, col] // sums[1, col]
+                elif numbers[col] > 0:
+                    out[k] = depths[col] // numbers[col]
                 else:
                     out[k] = 0

@@ -183,7 +183,7 @@ def before(pos: Any, j: Any, k: Any) -> Any:
 def height_above(pos: Any, x: Any, y: Any, z: Any, found: Any, soft: Any) -> Any:
     """Return (count, height above the surface, slope, distance and height above the nearest reference), metres."""
     n = 0
-    near = -1
+    near = np.int64(-1)
     near2 = np.int64(1) << 60
     for q in range(4):
         j = found[q]
