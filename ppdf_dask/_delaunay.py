@@ -36,7 +36,13 @@ _ROUNDING = 1e-15
 """Bound of the relative error of the floating-point filter: three products of rounded integers and two sums take less
 than 6 units of 2**-53, which is 6.7e-16."""
 
+_NEAR = 1 << 30
+"""Below this square of a distance three products of one and a turn, at most its equal, stay below 2**62."""
+
 _POINTS_PER_CELL = 2
+
+_SAMPLE = 32
+"""One point of so many goes first; see `_insert`."""
 
 
 @njit(nogil=True, cache=True)
@@ -71,6 +77,10 @@ def in_circle(ax, ay, bx, by, cx, cy, dx, dy):  # type: ignore[no-untyped-def]
     adx, ady, bdx, bdy, cdx, cdy = ax - dx, ay - dy, bx - dx, by - dy, cx - dx, cy - dy
     lift_a, lift_b, lift_c = adx * adx + ady * ady, bdx * bdx + bdy * bdy, cdx * cdx + cdy * cdy
     turn_a, turn_b, turn_c = bdx * cdy - bdy * cdx, cdx * ady - cdy * adx, adx * bdy - ady * bdx
+    if (lift_a | lift_b | lift_c) < _NEAR:
+        near = lift_a * turn_a + lift_b * turn_b + lift_c * turn_c
+        if near != 0:
+            return near > 0
     pa = float(lift_a) * float(turn_a)
     pb = float(lift_b) * float(turn_b)
     pc = float(lift_c) * float(turn_c)
@@ -102,7 +112,7 @@ def locate(vertices, triangles, t, x, y):  # type: ignore[no-untyped-def]
             other = triangles[t, 3 + i]
             if other == came:
                 continue
-            a, b = triangles[t, (i + 1) % 3], triangles[t, (i + 2) % 3]
+            a, b = triangles[t, i + 1 if i < 2 else 0], triangles[t, i - 1 if i > 0 else 2]
             ax, ay = np.int64(vertices[a, 0]), np.int64(vertices[a, 1])
             bx, by = np.int64(vertices[b, 0]), np.int64(vertices[b, 1])
             if orient(ax, ay, bx, by, x, y) < 0:
@@ -116,9 +126,13 @@ def locate(vertices, triangles, t, x, y):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _relink(triangles, t, old, new):  # type: ignore[no-untyped-def]
     if t >= 0:
-        for i in range(3, 6):
-            if triangles[t, i] == old:
-                triangles[t, i] = new
+        triangles[t, 3 + _slot(triangles, t, old)] = new
+
+
+@njit(nogil=True, cache=True)
+def _slot(triangles, t, neighbour):  # type: ignore[no-untyped-def]
+    """Return at which of the edges of `t` its neighbour lies; without branches, which would be guessed wrongly."""
+    return np.int64(triangles[t, 4] == neighbour) + 2 * np.int64(triangles[t, 5] == neighbour)
 
 
 @njit(nogil=True, cache=True)
@@ -136,17 +150,15 @@ def _legalise(vertices, triangles, stack, depth, x, y):  # type: ignore[no-untyp
         u = triangles[t, 3]
         if u < 0:
             continue
-        k = 0
-        while triangles[u, 3 + k] != t:
-            k += 1
-        d, b, a = triangles[u, k], triangles[u, (k + 1) % 3], triangles[u, (k + 2) % 3]
+        k = _slot(triangles, u, t)
+        after, before = k + 1 if k < 2 else 0, k - 1 if k > 0 else 2
+        p, a, b, d = triangles[t, 0], triangles[t, 1], triangles[t, 2], triangles[u, k]
         dx, dy = np.int64(vertices[d, 0]), np.int64(vertices[d, 1])
         bx, by = np.int64(vertices[b, 0]), np.int64(vertices[b, 1])
         ax, ay = np.int64(vertices[a, 0]), np.int64(vertices[a, 1])
         if not in_circle(dx, dy, bx, by, ax, ay, x, y):
             continue
-        p = triangles[t, 0]
-        beyond_bd, beyond_da = triangles[u, 3 + (k + 2) % 3], triangles[u, 3 + (k + 1) % 3]
+        beyond_bd, beyond_da = triangles[u, 3 + before], triangles[u, 3 + after]
         beyond_bp, beyond_pa = triangles[t, 4], triangles[t, 5]
         _set(triangles, t, p, a, d, beyond_da, u, beyond_pa)
         _set(triangles, u, p, d, b, beyond_bd, beyond_bp, t)
@@ -186,10 +198,21 @@ def insert_at(vertices, triangles, stack, count, t, x, y, z):  # type: ignore[no
 
 @njit(nogil=True, cache=True)
 def _insert(points, order, vertices, triangles, count):  # type: ignore[no-untyped-def]
-    """Insert `points` in `order`; return the new number of vertices. Of points at one place the lowest z stays."""
+    """Insert `points` in `order`; return the new number of vertices. Of points at one place the lowest z stays.
+
+    An even sample goes first, back to where the others begin: without it the curve's front would triangulate with the
+    far corners, and half as many edges again be flipped.
+    """
     stack = np.empty(len(triangles), np.int32)
     t = 2 * count - 7
-    for k in order:
+    sample = (len(order) + _SAMPLE // 2 - 1) // _SAMPLE
+    for i in range(len(order)):
+        if i < sample:
+            place = (sample - 1 - i) * _SAMPLE + _SAMPLE // 2
+        else:
+            group, place = divmod(i - sample, _SAMPLE - 1)
+            place += group * _SAMPLE + (place >= _SAMPLE // 2)
+        k = order[place]
         x, y, z = np.int64(points[k, 0]), np.int64(points[k, 1]), points[k, 2]
         t = locate(vertices, triangles, t, x, y)
         count = insert_at(vertices, triangles, stack, count, t, x, y, z)
@@ -224,26 +247,27 @@ def _curve_order(points, level):  # type: ignore[no-untyped-def]
     for i in range(n):
         x0, x1 = min(x0, points[i, 0]), max(x1, points[i, 0])
         y0, y1 = min(y0, points[i, 1]), max(y1, points[i, 1])
-    cell = (max(np.int64(x1) - x0, np.int64(y1) - y0) >> level) + 1
+    # A product is cheaper than a division, and where a point falls by rounding decides nothing.
+    cells = (1 << level) / (float(max(np.int64(x1) - x0, np.int64(y1) - y0)) + 1.0)
     keys = np.empty(n, np.int32)
-    starts = np.zeros((1 << (2 * level)) + 1, np.int64)
+    starts = np.zeros((1 << (2 * level)) + 1, np.int32)
     for i in range(n):
-        key = _hilbert((np.int64(points[i, 0]) - x0) // cell, (np.int64(points[i, 1]) - y0) // cell, level)
+        key = _hilbert(int((np.int64(points[i, 0]) - x0) * cells), int((np.int64(points[i, 1]) - y0) * cells), level)
         keys[i] = key
         starts[key + 1] += 1
     for i in range(1, len(starts)):
         starts[i] += starts[i - 1]
-    order = np.empty(n, np.int64)
+    order = np.empty(n, np.int32)
     for i in range(n):
         order[starts[keys[i]]] = i
         starts[keys[i]] += 1
     return order
 
 
-def curve_order(points: NDArray[np.int32]) -> NDArray[np.int64]:
+def curve_order(points: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the order of `points`, (n, 2 or more), along a Hilbert curve: neighbours in it are near in the plane."""
     level = max(1, int(np.ceil(np.log2(max(len(points) / _POINTS_PER_CELL, 1)) / 2)))
-    order: NDArray[np.int64] = _curve_order(points, min(level, 14))
+    order: NDArray[np.int32] = _curve_order(points, min(level, 14))
     return order
 
 

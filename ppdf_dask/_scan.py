@@ -14,6 +14,9 @@ from numba import njit
 
 from ppdf_dask._delaunay import CORNERS, orient
 
+_SLACK = 1e-6
+"""Pixels by which a triangle's box is taken too large, far more than rounding: what counts is decided in integers."""
+
 
 @njit(nogil=True, cache=True)
 def _squared(ax, ay, bx, by):  # type: ignore[no-untyped-def]
@@ -62,7 +65,7 @@ def _ask(need, x0, y0, x1, y1, ex0, ey0, ex1, ey1):  # type: ignore[no-untyped-d
 
 
 @njit(nogil=True, cache=True)
-def heights(vertices, triangles, first, step, limits, extent, out, need):  # type: ignore[no-untyped-def]
+def heights(vertices, triangles, first, step, limits, extent, out, home, need):  # type: ignore[no-untyped-def]
     """Fill `out` with the heights in mm of the pixels and widen `need` by what a proof would have to see.
 
     Parameters
@@ -79,21 +82,25 @@ def heights(vertices, triangles, first, step, limits, extent, out, need):  # typ
         Closed box (x0, y0, x1, y1), mm: where points can be at all.
     out : ndarray of float64, (k, rows, columns)
         Heights in mm, NaN on entry.
+    home : ndarray of int32, (rows, columns)
+        Set to a triangle that holds the pixel's centre.
     need : ndarray of int64, (4,)
         Closed box, mm; widened where a pixel's triangle might change if more were loaded.
     """
     layers, rows, columns = out.shape
     reach = 2 * limits[-1]
+    inverse = 1.0 / step
     for t in range(len(triangles)):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ax, ay = np.int64(vertices[i, 0]), np.int64(vertices[i, 1])
         bx, by = np.int64(vertices[j, 0]), np.int64(vertices[j, 1])
         cx, cy = np.int64(vertices[k, 0]), np.int64(vertices[k, 1])
-        c0 = max(0, -((first[0] - 2 * min(ax, bx, cx)) // step))
-        c1 = min(columns - 1, (2 * max(ax, bx, cx) - first[0]) // step)
-        r0 = max(0, -((2 * max(ay, by, cy) - first[1]) // step))
-        r1 = min(rows - 1, (first[1] - 2 * min(ay, by, cy)) // step)
-        if c0 > c1 or r0 > r1:
+        # Most triangles lie between the centres, and dividing integers would be the larger part of the work.
+        c0 = max(0, math.ceil((2 * min(ax, bx, cx) - first[0]) * inverse - _SLACK))
+        c1 = min(columns - 1, math.floor((2 * max(ax, bx, cx) - first[0]) * inverse + _SLACK))
+        r0 = max(0, math.ceil((first[1] - 2 * max(ay, by, cy)) * inverse - _SLACK))
+        r1 = min(rows - 1, math.floor((first[1] - 2 * min(ay, by, cy)) * inverse + _SLACK))
+        if (c0 > c1) | (r0 > r1):
             continue
         real = i >= CORNERS and j >= CORNERS and k >= CORNERS
         used_c0, used_c1, used_r0, used_r1 = columns, -1, rows, -1
@@ -111,6 +118,8 @@ def heights(vertices, triangles, first, step, limits, extent, out, need):  # typ
                 continue
             used_c0, used_c1 = min(used_c0, low), max(used_c1, high)
             used_r0, used_r1 = min(used_r0, r), max(used_r1, r)
+            for c in range(low, high + 1):
+                home[r, c] = t
             if not real:
                 continue
             if not measured:
@@ -169,28 +178,72 @@ def _around(vertices, triangles, v, t, x, y, best, best_v, best_t):  # type: ign
 
 
 @njit(nogil=True, cache=True)
-def distances(vertices, triangles, first, step, limit, extent, out, need):  # type: ignore[no-untyped-def]
+def distances(vertices, triangles, home, first, step, limit, extent, out, need):  # type: ignore[no-untyped-def]
     """Fill `out` with the distance in mm of each pixel's centre to the nearest point, inf beyond `limit` mm.
 
-    From a point that is not the nearest, an edge of the Delaunay triangulation leads to a nearer one; so each pixel
-    walks from its neighbour's nearest point. The corners lie farther off than any limit.
+    First each point tells the pixels around it. One that hears of a point within one and a half pixels has heard of
+    the nearest. The others walk: from a point that is not the nearest, an edge of the Delaunay triangulation leads to
+    a nearer one. A walk begins where the last one ended or, where that is nearer, at the triangle that `heights` found.
+    The corners lie farther off than any limit.
     """
     rows, columns = out.shape
-    v, t = triangles[0, 0], 0
+    _tell(vertices, first, step, out)
+    t = home[0, 0]
+    v = triangles[t, 0]
     for r in range(rows):
         # Rows run to and fro, so that the walk stays short.
         for k in range(columns):
             c = k if r % 2 == 0 else columns - 1 - k
             x, y = first[0] + c * step, first[1] - r * step
-            best = _squared(2 * np.int64(vertices[v, 0]), 2 * np.int64(vertices[v, 1]), x, y)
-            while True:
-                nearest, w, u = _around(vertices, triangles, v, t, x, y, best, v, t)
-                if nearest >= best:
-                    break
-                best, v, t = nearest, w, u
-            if best <= 4 * limit * limit and v >= CORNERS:
+            gap_x, gap_y = max(2 * extent[0] - x, x - 2 * extent[2], 0), max(2 * extent[1] - y, y - 2 * extent[3], 0)
+            if gap_x * gap_x + gap_y * gap_y > 4 * limit * limit:
+                out[r, c] = np.inf
+                continue
+            if 4.0 * out[r, c] < 9.0 * step * step:
+                best, found = np.int64(out[r, c]), True
+            else:
+                best = _squared(2 * np.int64(vertices[v, 0]), 2 * np.int64(vertices[v, 1]), x, y)
+                for i in range(3):
+                    w = triangles[home[r, c], i]
+                    nearest = _squared(2 * np.int64(vertices[w, 0]), 2 * np.int64(vertices[w, 1]), x, y)
+                    if nearest < best:
+                        best, v, t = nearest, w, home[r, c]
+                while True:
+                    nearest, w, u = _around(vertices, triangles, v, t, x, y, best, v, t)
+                    if nearest >= best:
+                        break
+                    best, v, t = nearest, w, u
+                found = v >= CORNERS
+            if found and best <= 4 * limit * limit:
                 out[r, c] = math.sqrt(float(best)) / 2.0
                 d = out[r, c] + 1.0
             else:
+                out[r, c] = np.inf
                 d = float(limit)
             _ask(need, x / 2.0 - d, y / 2.0 - d, x / 2.0 + d, y / 2.0 + d, extent[0], extent[1], extent[2], extent[3])
+
+
+@njit(nogil=True, cache=True)
+def _tell(vertices, first, step, out):  # type: ignore[no-untyped-def]
+    """Lower the squared distances in `out`, half mm, to each point's at the 3 x 3 pixels around its own."""
+    rows, columns = out.shape
+    inverse = 1.0 / step
+    for v in range(CORNERS, len(vertices)):
+        x, y = 2 * np.int64(vertices[v, 0]) - first[0], first[1] - 2 * np.int64(vertices[v, 1])
+        # Rounding can move a point on a pixel's edge only, which the centre beyond the next one need not hear of.
+        c, r = math.floor(x * inverse + 0.5), math.floor(y * inverse + 0.5)
+        if c < -1 or r < -1 or c > columns or r > rows:
+            continue
+        whole = 1 <= c < columns - 1
+        left = float((c - 1) * step - x)
+        one, two, three = left * left, (left + step) * (left + step), (left + 2 * step) * (left + 2 * step)
+        for i in range(max(0, r - 1), min(rows, r + 2)):
+            across = float(i * step - y)
+            across *= across
+            if whole:
+                out[i, c - 1] = min(out[i, c - 1], one + across)
+                out[i, c] = min(out[i, c], two + across)
+                out[i, c + 1] = min(out[i, c + 1], three + across)
+            else:
+                for j in range(max(0, c - 1), min(columns, c + 2)):
+                    out[i, j] = min(out[i, j], float((j * step - x) ** 2) + across)

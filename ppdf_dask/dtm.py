@@ -355,13 +355,14 @@ def _prove(
     )
     everywhere = window.rect.grow(4 * limits[-1])
     known = tin.box(everywhere if extent is None else extent)
+    home = np.empty(shape, np.int32)
     while True:
         z = np.full((len(limits), *shape), np.nan)
         d = np.full(shape, np.inf)
         need = tin.box(window.rect)
-        heights(*tin.arrays, first, 2 * resolution, np.array(limits, np.int64), known, z, need)
+        heights(*tin.arrays, first, 2 * resolution, np.array(limits, np.int64), known, z, home, need)
         if loaded.contains(tin.rect(need)):
-            distances(*tin.arrays, first, 2 * resolution, limits[-1], known, d, need)
+            distances(*tin.arrays, home, first, 2 * resolution, limits[-1], known, d, need)
             if loaded.contains(tin.rect(need)):
                 return z, d, loaded
         wider = loaded.union(tin.rect(need))

@@ -76,7 +76,11 @@ def turn(a, b, c):
 
 
 coordinate = st.one_of(
-    st.integers(-3, 3), st.integers(-(2**26), 2**26), st.sampled_from([k * 2**22 for k in range(-16, 17)])
+    st.integers(-3, 3),
+    st.integers(-(2**15), 2**15),
+    st.integers(-(2**20), 2**20),
+    st.integers(-(2**26), 2**26),
+    st.sampled_from([k * 2**22 for k in range(-16, 17)]),
 )
 
 
@@ -193,6 +197,40 @@ def test_heights_and_distances_agree_with_scipy(seed):
         np.testing.assert_allclose(got.distance.ravel(), wanted, rtol=1e-7)
 
 
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 700),
+    st.sampled_from([1, 3, 40]),
+    st.sampled_from([1, 2, 30]),
+    st.booleans(),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_home_holds_its_pixel_and_every_distance_is_the_nearest_points(seed, n, resolution, limit, extent):
+    """In steps of a quarter of a pixel, so that points lie on centres, edges and corners of pixels; in integers."""
+    rng = np.random.default_rng(seed)
+    spread = int(rng.integers(1, 200))
+    points = rng.integers(-spread, spread, (n, 3)).astype(np.int32)
+    points[:, :2] += rng.integers(-60, 60, 2).astype(np.int32)
+    tin = Triangulation(100_000)
+    tin.insert(points)
+    first, step, shape = rng.integers(-100, 100, 2), 2 * resolution, (13, 17)
+    z, d, home = np.full((1, *shape), np.nan), np.full(shape, np.inf), np.full(shape, -1, np.int32)
+    box = np.array([-(10**5), -(10**5), 10**5, 10**5])
+    limits, need = np.array([limit * resolution]), box.copy()
+    if extent:
+        box[:2], box[2:] = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    dtm.heights(tin.vertices, tin.triangles, first, step, limits, box, z, home, need)
+    dtm.distances(tin.vertices, tin.triangles, home, first, step, limits[-1], box, d, need)
+    x, y = np.meshgrid(first[0] + step * np.arange(shape[1]), first[1] - step * np.arange(shape[0]))
+    squared = ((x[..., None] - 2 * points[:, 0]) ** 2 + (y[..., None] - 2 * points[:, 1]) ** 2).min(axis=-1)
+    wanted = np.where(squared <= 4 * limits[-1] ** 2, np.sqrt(squared) / 2, np.inf)
+    np.testing.assert_array_equal(d, wanted)
+    corners = 2 * tin.vertices[tin.triangles[home, :3], :2].astype(np.int64)
+    for k in range(3):
+        (px, py), (qx, qy) = (np.moveaxis(corners[..., (k + i) % 3, :], -1, 0) for i in (1, 2))
+        assert ((qx - px) * (y - py) >= (qy - py) * (x - px)).all()
+
+
 @st.composite
 def surveys(draw):
     """Random, gridded, collinear, clustered and doubled ground, several blocks wide."""
@@ -221,9 +259,10 @@ def at_once(points, block, limits, resolution=1000):
     z = np.full((len(limits), dtm.BLOCK, dtm.BLOCK), np.nan)
     d = np.full(z.shape[1:], np.inf)
     box = np.array([-(10**6), -(10**6), 10**6, 10**6])
-    arrays = tin.vertices, tin.triangles, first, 2 * resolution
-    dtm.heights(*arrays, np.array(limits), box, z, box.copy())
-    dtm.distances(*arrays, limits[-1], box, d, box.copy())
+    home = np.empty(d.shape, np.int32)
+    pixels = first, 2 * resolution
+    dtm.heights(tin.vertices, tin.triangles, *pixels, np.array(limits), box, z, home, box.copy())
+    dtm.distances(tin.vertices, tin.triangles, home, *pixels, limits[-1], box, d, box.copy())
     return z[0], d, z[-1]
 
 
