@@ -24,6 +24,17 @@ def _squared(ax, ay, bx, by):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
+def crop(points, shift_x, shift_y, box, out, end):  # type: ignore[no-untyped-def]
+    """Append the shifted points, (3, n), that lie in the closed box to the rows of `out`; return their new number."""
+    for i in range(points.shape[1]):
+        x, y = points[0, i] + shift_x, points[1, i] + shift_y
+        if box[0] <= x <= box[2] and box[1] <= y <= box[3]:
+            out[end, 0], out[end, 1], out[end, 2] = x, y, points[2, i]
+            end += 1
+    return end
+
+
+@njit(nogil=True, cache=True)
 def _longest_and_radius(ax, ay, bx, by, cx, cy):  # type: ignore[no-untyped-def]
     """Return the squared longest edge and the squared radius of the circle; vertices in the order of (x, y)."""
     p, q, r = _squared(ax, ay, bx, by), _squared(bx, by, cx, cy), _squared(cx, cy, ax, ay)

@@ -25,7 +25,7 @@ The proof
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppdf_dask._delaunay import Triangulation
-from ppdf_dask._scan import distances, heights
+from ppdf_dask._scan import crop, distances, heights
 from ppdf_dask.errors import ParameterError, PlanError
 from ppdf_dask.grid import MM, Rect
 from ppdf_dask.params import DtmParams
@@ -53,8 +53,24 @@ WINDOW = 512 * MM
 MAX_POINTS = 3_000_000
 """A window with more points is cut in four: 100 bytes per point are needed."""
 
-Load = Callable[[Rect], NDArray[Any]]
-"""Gives at least the ground points inside a rectangle: integers, mm, absolute, (n, 3), in any order."""
+
+@dataclass(frozen=True)
+class Part:
+    """Ground points counted from a place of their own: `points` (3, n) int32, mm, x and y from (`x`, `y`)."""
+
+    x: int
+    y: int
+    points: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, points: NDArray[Any]) -> Part:
+        """Make a part of absolute points, mm, (n, 3)."""
+        x, y = (int(v) for v in points[:, :2].min(axis=0)) if len(points) else (0, 0)
+        return cls(x, y, np.ascontiguousarray((points - [x, y, 0]).T, dtype=np.int32))
+
+
+Load = Callable[[Rect], Iterable[Part]]
+"""Gives parts that hold at least the ground points inside a rectangle."""
 
 
 @dataclass(frozen=True, order=True)
@@ -225,9 +241,8 @@ def rasterize_block(
     block : Block
         The block; see `DtmGrid`.
     load : callable
-        ``load(rect)`` gives all ground points with ``x0 <= x < x1`` and ``y0 <= y < y1`` as integers, mm, (n, 3), in
-        any order, others too if that is easier; it is called with rectangles in and around the block, up to
-        2 `max_edge` away.
+        ``load(rect)`` gives parts with all ground points with ``x0 <= x < x1`` and ``y0 <= y < y1``, in any order,
+        others too if that is easier; it is called with rectangles in and around the block, up to 2 `max_edge` away.
     params : DtmParams
         Resolution and limits, metres.
     extent : Rect, optional
@@ -251,7 +266,7 @@ def rasterize_block(
     --------
     >>> points = np.array([[0, 0, 1000], [100_000, 0, 1000], [0, 100_000, 2000], [100_000, 100_000, 2000]])
     >>> grid = DtmGrid.from_params(DtmParams(max_edge=150.0))
-    >>> result = rasterize_block(grid.block(-1, 0), lambda rect: points, DtmParams(max_edge=150.0))
+    >>> result = rasterize_block(grid.block(-1, 0), lambda rect: [Part.of(points)], DtmParams(max_edge=150.0))
     >>> float(result.height[511, 0]), float(result.height[511 - 99, 99]), float(result.height[0, 0])
     (1.0049999952316284, 1.9950000047683716, nan)
     """
@@ -320,14 +335,14 @@ class _Tin:
     def arrays(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         return self._mesh.vertices, self._mesh.triangles
 
-    def localise(self, points: NDArray[Any], inside: Rect) -> NDArray[np.int32]:
-        """Return those of the absolute points that lie inside a rectangle, from the window's centre."""
-        points = np.asarray(points)
-        x, y = points[:, 0], points[:, 1]
-        keep = (x >= inside.x0) & (x < inside.x1) & (y >= inside.y0) & (y < inside.y1)
-        local = np.empty((int(np.count_nonzero(keep)), 3), dtype=np.int32)
-        local[:, 0], local[:, 1], local[:, 2] = x[keep] - self.x, y[keep] - self.y, points[keep, 2]
-        return local
+    def localise(self, parts: Iterable[Part], inside: Rect) -> NDArray[np.int32]:
+        """Return those of the points that lie inside a rectangle, from the window's centre."""
+        parts, box, end = list(parts), self.box(inside), 0
+        # As large as if all were inside: memory that is never written costs nothing, a copy in between does.
+        local = np.empty((sum(p.points.shape[1] for p in parts), 3), dtype=np.int32)
+        for part in parts:
+            end = crop(part.points, part.x - self.x, part.y - self.y, box, local, end)
+        return local[:end]
 
     def insert(self, local: NDArray[np.int32]) -> None:
         """Insert points counted from the window's centre."""

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ppdf_dask.dtm import BLOCK, Block, Raster, rasterize_block
+from ppdf_dask.dtm import BLOCK, Block, Part, Raster, rasterize_block
 from ppdf_dask.grid import MM, Chunk, Rect
 from ppdf_dask.index import owns_points
 from ppdf_dask.mosaic import raster_attributes, spatial_ref
-from ppdf_dask.neighbourhood import KEPT_POINTS, Cut, inside
+from ppdf_dask.neighbourhood import KEPT_POINTS, Cut
 from ppdf_dask.params import DtmParams
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import Survey
@@ -79,7 +79,7 @@ def jobs(raster: Raster, ground: dict[Rect, int], params: DtmParams) -> Iterator
 def rasterize(store: RunStore, job: RasterJob, into: RunStore | None = None) -> dict[str, Any]:
     """Compute one block and write its shards, into another store if one is given (`debug`)."""
     into, ground = into or store, _Ground(store, job.cut)
-    found = rasterize_block(job.block, ground.inside, job.params, extent=job.cut.extent, unit_z=job.unit_z)
+    found = rasterize_block(job.block, ground.around, job.params, extent=job.cut.extent, unit_z=job.unit_z)
     row, column = job.block.row - job.raster.row, job.block.col - job.raster.col
     into.write_block("height", row, column, found.height)
     into.write_block("distance", row, column, found.distance)
@@ -103,17 +103,10 @@ class _Ground:
         self._store, self._cut = store, cut
         self._kept: dict[str, npt.NDArray[np.int32]] = {}
 
-    def inside(self, rect: Rect) -> npt.NDArray[np.int64]:
-        """Return the points inside a rectangle: absolute, mm, (n, 3)."""
-        parts = [np.empty((3, 0), np.int64)]
+    def around(self, rect: Rect) -> Iterator[Part]:
+        """Yield the points of all chunks that share something with a rectangle."""
         for chunk in self._cut.grid.over(_clip(rect, self._cut.extent)):
-            points, home = self._of(chunk), chunk.core
-            # Cropped before it is widened: a margin takes a strip of a chunk.
-            near: npt.NDArray[np.int64] = points[:, inside(points, home, rect)].astype(np.int64)
-            near[0] += home.x0
-            near[1] += home.y0
-            parts.append(near)
-        return np.concatenate(parts, axis=1).T
+            yield Part(chunk.core.x0, chunk.core.y0, self._of(chunk))
 
     def _of(self, chunk: Chunk) -> npt.NDArray[np.int32]:
         if chunk.id not in self._kept:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ppdf_dask.dtm import BLOCK, DtmGrid, Raster, rasterize_block
+from ppdf_dask.dtm import BLOCK, DtmGrid, Part, Raster, rasterize_block
 from ppdf_dask.errors import ParameterError
 from ppdf_dask.grid import MM, Rect
 from ppdf_dask.params import DtmParams
@@ -229,11 +229,11 @@ def terrain(ground: Longs, rect: Rect, params: DtmParams | None = None) -> Singl
         return np.full((rows, columns), np.nan, np.float32)
     raster = Raster.over(grid, rect)
     whole = np.full(raster.shape, np.nan, np.float32)
-    known = bounds(ground)
+    known, parts = bounds(ground), [Part.of(ground)]
     for block in grid.over(rect):
         if block.rect.intersects(known):
             r, c = raster.offset(block)
-            found = rasterize_block(block, lambda _: ground, params, extent=known)
+            found = rasterize_block(block, lambda _: parts, params, extent=known)
             whole[r : r + BLOCK, c : c + BLOCK] = found.height
     r, c = (raster.rect.y1 - rect.y1) // step, (rect.x0 - raster.rect.x0) // step
     return whole[r : r + rows, c : c + columns].copy()

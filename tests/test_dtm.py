@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay, cKDTree
 
 from ppdf_dask import _delaunay, dtm
 from ppdf_dask._delaunay import CORNERS, Triangulation
-from ppdf_dask.dtm import DtmGrid, Raster, rasterize_block
+from ppdf_dask.dtm import DtmGrid, Part, Raster, rasterize_block
 from ppdf_dask.errors import ParameterError
 from ppdf_dask.grid import Rect
 from ppdf_dask.params import DtmParams
@@ -32,7 +32,7 @@ def loader(points, seen=None):
         if seen is not None:
             seen.append(rect)
         x, y = points[:, 0], points[:, 1]
-        return points[(x >= rect.x0) & (x < rect.x1) & (y >= rect.y0) & (y < rect.y1)]
+        return [Part.of(points[(x >= rect.x0) & (x < rect.x1) & (y >= rect.y0) & (y < rect.y1)])]
 
     return load
 
@@ -289,7 +289,9 @@ def test_the_result_depends_on_the_ground_only(points, margin, window, most, kno
         block = DtmGrid(1000).block(-1, 0)
         extent = Rect(-60_000, -60_000, 90_000, 90_000) if known else None
         got = rasterize_block(block, loader(points[order], seen), params, extent=extent, first_margin=margin)
-        generous = rasterize_block(block, lambda _: points, params, first_margin=margin)
+        generous = rasterize_block(
+            block, lambda _: [Part.of(points[::2]), Part.of(points[1::2])], params, first_margin=margin
+        )
         assert as_bytes(generous) == as_bytes(got), "whole chunks, as the store gives them"
         assert (generous.points, generous.margin) == (got.points, got.margin) or known
         whole, again = (at_once(p, block, [8000, 20_000]) for p in (points, points[order]))
