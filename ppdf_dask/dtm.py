@@ -337,12 +337,13 @@ class _Tin:
 
     def localise(self, parts: Iterable[Part], inside: Rect) -> NDArray[np.int32]:
         """Return those of the points that lie inside a rectangle, from the window's centre."""
-        parts, box, end = list(parts), self.box(inside), 0
-        # As large as if all were inside: memory that is never written costs nothing, a copy in between does.
-        local = np.empty((sum(p.points.shape[1] for p in parts), 3), dtype=np.int32)
+        box, pieces = self.box(inside), [np.empty((0, 3), dtype=np.int32)]
         for part in parts:
-            end = crop(part.points, part.x - self.x, part.y - self.y, box, local, end)
-        return local[:end]
+            # As large as if all were inside: what is never written costs nothing. Piece by piece, so that a loader need
+            # not keep all its parts at once.
+            piece = np.empty((part.points.shape[1], 3), dtype=np.int32)
+            pieces.append(piece[: crop(part.points, part.x - self.x, part.y - self.y, box, piece, 0)])
+        return np.concatenate(pieces)
 
     def insert(self, local: NDArray[np.int32]) -> None:
         """Insert points counted from the window's centre."""
