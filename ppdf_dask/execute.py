@@ -1,6 +1,8 @@
 """One stage on a cluster: a bounded window of futures, retries, the culprit alone, failures by name.
 
 Neither the client nor the scheduler ever holds more than the window, so their memory does not grow with the survey.
+What comes back together is fetched together, and what there is room for goes out together: each message costs the
+client, the scheduler and the workers a few milliseconds, however many pieces of work it is about.
 Keys are ``<stage>-<id>-<token>``: the dashboard groups by stage, ids can be searched, two runs do not collide.
 
 A piece of work that raises something unforeseen is tried again; one that says in plain words what is wrong (a
@@ -11,10 +13,12 @@ tried again at the end of the stage, one piece at a time, so that only the culpr
 from __future__ import annotations
 
 import contextlib
+import json
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +34,15 @@ RETRIES = 2
 
 WINDOW_PER_THREAD = 3
 """Futures in flight per worker thread: one running, the next ones already there."""
+
+AHEAD = 1.0
+"""Seconds of work in flight at least: pieces that take less than a message would else keep no worker busy."""
+
+LINGER = 0.05
+"""Seconds that what came back waits for more to be fetched with it: the workers have their next pieces already."""
+
+WIDEST_PER_THREAD = 32
+"""Futures in flight per worker thread at most, however short the work is."""
 
 POLL = 1.0
 """Seconds between two looks at scheduler and lock while no result comes."""
@@ -90,11 +103,12 @@ class _Flight:
     stage: Stage
     on_event: Listener
     check: Callable[[], None]
-    arrived: SimpleQueue[Future[dict[str, Any]]] = field(default_factory=SimpleQueue)
-    flying: dict[str, tuple[Work, Future[dict[str, Any]]]] = field(default_factory=dict)
+    arrived: SimpleQueue[Future[bytes]] = field(default_factory=SimpleQueue)
+    flying: dict[str, tuple[Work, Future[bytes]]] = field(default_factory=dict)
     tries: dict[str, int] = field(default_factory=dict)
     suspects: list[Work] = field(default_factory=list)
     room: int = 0
+    landed: int = 0
     asked: float = float("-inf")
     alone: float | None = None
     address: str = field(init=False)
@@ -103,17 +117,21 @@ class _Flight:
         # A client that was closed no longer knows it.
         self.address = str(getattr(self.client.scheduler, "address", "?"))
 
-    def submit(self, work: Work) -> None:
-        """Send one piece of work to the cluster."""
+    def submit(self, works: list[Work]) -> None:
+        """Send pieces of work to the cluster, in one message."""
+        keys = [self._key(work) for work in works]
+        stage, jobs, fingerprints = self.stage, [w.job for w in works], [w.fingerprint for w in works]
+        functions, urls = [stage.function] * len(works), [stage.url] * len(works)
+        with self._cluster_faults(works[0]):
+            futures = self.client.map(_packed, functions, urls, jobs, fingerprints, key=keys, pure=False)
+        self.flying.update(zip(keys, zip(works, futures, strict=True), strict=True))
+        for work, future in zip(works, futures, strict=True):
+            self.on_event(Event(stage.name, "sent", work.ident))
+            future.add_done_callback(self.arrived.put)
+
+    def _key(self, work: Work) -> str:
         tries = self.tries[work.ident] = self.tries.get(work.ident, 0) + 1
-        key = f"{self.stage.name}-{work.ident}-{self.stage.token}" + (f"-{tries}" if tries > 1 else "")
-        with self._cluster_faults(work):
-            future = self.client.submit(
-                self.stage.function, self.stage.url, work.job, work.fingerprint, key=key, pure=False
-            )
-        self.flying[key] = (work, future)
-        self.on_event(Event(self.stage.name, "sent", work.ident))
-        future.add_done_callback(self.arrived.put)
+        return f"{self.stage.name}-{work.ident}-{self.stage.token}" + (f"-{tries}" if tries > 1 else "")
 
     def window(self) -> int:
         """Return how many pieces may fly; the cluster is asked once a second at most."""
@@ -121,7 +139,8 @@ class _Flight:
         if now >= self.asked + POLL:
             with self._cluster_faults(None):
                 threads = sum(self.client.nthreads().values())
-            self.room, self.asked = max(4, WINDOW_PER_THREAD * threads), now
+            busy = min(AHEAD * self.landed / (now - self.asked), WIDEST_PER_THREAD * threads)
+            self.room, self.asked, self.landed = max(4, WINDOW_PER_THREAD * threads, round(busy)), now, 0
             self._say_when_alone(threads, now)
         return self.room
 
@@ -138,27 +157,53 @@ class _Flight:
             )
             self.on_event(Event(self.stage.name, "noted", record={"warning": warning}))
 
-    def land(self) -> tuple[Work, dict[str, Any] | Failure] | None:
-        """Wait for one piece; return its record or failure, None when it is to fly again."""
+    def land(self) -> Iterator[tuple[Work, dict[str, Any] | Failure]]:
+        """Wait for work to come back; yield records and failures of what does not fly again."""
+        back = [(future, self.flying.pop(str(future.key))[0]) for future in self._arrivals()]
+        self.landed += len(back)
+        records = self._fetch(back)
+        for future, work in back:
+            error, trace = None, None
+            if future.status == "error":
+                with self._cluster_faults(work):
+                    error, trace = future.exception(), future.traceback()
+            future.release()
+            outcome = (work, json.loads(records[future.key])) if error is None else self._judge(work, error, trace)
+            if outcome is not None:
+                del self.tries[work.ident]
+                yield outcome
+
+    def _fetch(self, back: list[tuple[Future[bytes], Work]]) -> dict[Any, bytes]:
+        """Return the packed records of those that are finished, by key, in one message."""
+        self._refuse_lost(back)
+        finished = {future.key: future for future, _ in back if future.status == "finished"}
+        if not finished:
+            return {}
+        with self._cluster_faults(back[0][1]):
+            # A record whose worker died meanwhile is made again; that can fail, or be the end of the scheduler.
+            records: dict[Any, bytes] = self.client.gather(finished, errors="skip")
+        self._refuse_lost(back)
+        return records
+
+    def _refuse_lost(self, back: list[tuple[Future[bytes], Work]]) -> None:
+        for future, work in back:
+            if future.status not in ("finished", "error"):
+                raise self._lost(work)
+
+    def _arrivals(self) -> list[Future[bytes]]:
+        """Wait for a future that is done; return it and those that come soon after."""
         while True:
             try:
-                future = self.arrived.get(timeout=POLL)
+                found = [self.arrived.get(timeout=POLL)]
                 break
             except Empty:
                 self.check()
                 if self.client.status != "running":
                     raise self._lost(None) from None
                 self.window()
-        work, _ = self.flying.pop(str(future.key))
-        if future.status not in ("finished", "error"):
-            raise self._lost(work)
-        with self._cluster_faults(work):
-            if future.status == "finished":
-                record: dict[str, Any] = future.result()
-                return work, record
-            error, trace = future.exception(), future.traceback()
-        future.release()
-        return self._judge(work, error, trace)
+        if self.arrived.qsize() + 1 < len(self.flying):
+            time.sleep(LINGER)
+        return found + [self.arrived.get_nowait() for _ in range(self.arrived.qsize())]
 
     def _judge(self, work: Work, error: Any, trace: Any) -> tuple[Work, Failure] | None:
         if isinstance(error, DiskFullError):
@@ -170,7 +215,7 @@ class _Flight:
             if killed:
                 self.suspects.append(work)
             else:
-                self.submit(work)
+                self.submit([work])
             return None
         text = str(error) or type(error).__name__
         if killed:
@@ -210,6 +255,11 @@ class _Flight:
                 self.client.cancel(futures, force=True)
 
 
+def _packed(function: Callable[..., dict[str, Any]], url: str, job: Any, fingerprint: str) -> bytes:
+    """Run a piece of work; its record as it is in the ledger, else Dask measures and packs each value of it anew."""
+    return json.dumps(function(url, job, fingerprint)).encode()
+
+
 def nothing() -> None:
     """Check nothing."""
 
@@ -247,23 +297,19 @@ def execute(
     waiting = iter(todo)
     try:
         while True:
-            room = flight.window() - len(flight.flying)
-            while room > 0 and (work := next(waiting, None)) is not None:
-                flight.submit(work)
-                room -= 1
-            if not flight.flying:
+            works = list(islice(waiting, max(0, flight.window() - len(flight.flying))))
+            if not works and not flight.flying:
                 if not flight.suspects:
                     return
-                flight.submit(flight.suspects.pop(0))
-            landed = flight.land()
-            if landed is None:
-                continue
-            work, outcome = landed
-            check()
-            if isinstance(outcome, Failure):
-                on_event(Event(stage.name, "failed", work.ident, work.points, record={"error": outcome.error}))
-            else:
-                on_event(Event(stage.name, "done", work.ident, work.points, record=outcome))
-            yield work, outcome
+                works = [flight.suspects.pop(0)]
+            if works:
+                flight.submit(works)
+            for work, outcome in flight.land():
+                check()
+                if isinstance(outcome, Failure):
+                    on_event(Event(stage.name, "failed", work.ident, work.points, record={"error": outcome.error}))
+                else:
+                    on_event(Event(stage.name, "done", work.ident, work.points, record=outcome))
+                yield work, outcome
     finally:
         flight.abandon()

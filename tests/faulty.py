@@ -41,16 +41,23 @@ class Inline:
     def nthreads(self) -> dict[str, int]:
         return {"inline": 1}
 
-    def submit(self, function: Any, url: str, job: Any, fingerprint: str, *, key: str, pure: bool) -> Any:
+    def map(self, call: Any, *arguments: list[Any], key: list[str], pure: bool) -> list[Any]:
+        return [self._at_once(call, given, name) for *given, name in zip(*arguments, key, strict=True)]
+
+    def _at_once(self, call: Any, given: list[Any], key: str) -> Any:
+        _, _, job, _ = given
         self.ran.append("-".join(key.split("-")[:2]))
         future = _Future(key)
         try:
             if self._fault is not None:
                 self._fault(self.ran[-1], job)
-            future.record = function(url, job, fingerprint)
+            future.record = call(*given)
         except Exception as error:
             future.error, future.status = error, "error"
         return future
+
+    def gather(self, futures: dict[str, Any], errors: str) -> dict[str, Any]:
+        return {key: future.record for key, future in futures.items()}
 
     def cancel(self, futures: Any, force: bool) -> None:
         pass
@@ -62,9 +69,6 @@ class _Future:
 
     def add_done_callback(self, call: Any) -> None:
         call(self)
-
-    def result(self) -> Any:
-        return self.record
 
     def exception(self) -> Any:
         return self.error

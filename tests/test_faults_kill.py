@@ -112,17 +112,17 @@ def test_f39_f34_work_that_runs_twice_at_once_does_no_harm(tiles, undisturbed, t
     """A second writer of the same piece interleaves with the first at every put, as a stopped worker that wakes up."""
 
     class Twice(Inline):
-        def submit(self, function, url, job, fingerprint, **rest):
+        def map(self, call, *given, **rest):
             def both(*arguments):
-                first = function(*arguments)
+                first = call(*arguments)
                 with at_put(-1, killed) as keys:
-                    function(*arguments)
+                    call(*arguments)
                 for moment in (0, len(keys) // 2, len(keys) - 1):
-                    with at_put(moment, lambda key, value, put: (function(*arguments), put())):
-                        function(*arguments)
+                    with at_put(moment, lambda key, value, put: (call(*arguments), put())):
+                        call(*arguments)
                 return first
 
-            return super().submit(both, url, job, fingerprint, **rest)
+            return super().map(both, *given, **rest)
 
     small_plan(tiles, tmp_path).run(Twice())
     assert same(tmp_path, undisturbed)
