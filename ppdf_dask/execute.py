@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from ppdf_dask.errors import ClusterError, DamagedError, DiskFullError, PpdfError
 from ppdf_dask.events import Event, Listener
+from ppdf_dask.ledger import lean
 from ppdf_dask.quarantine import Failure
 
 if TYPE_CHECKING:
@@ -168,7 +169,9 @@ class _Flight:
                 with self._cluster_faults(work):
                     error, trace = future.exception(), future.traceback()
             future.release()
-            outcome = (work, json.loads(records[future.key])) if error is None else self._judge(work, error, trace)
+            outcome = (
+                (work, lean(json.loads(records[future.key]))) if error is None else self._judge(work, error, trace)
+            )
             if outcome is not None:
                 del self.tries[work.ident]
                 yield outcome

@@ -94,3 +94,11 @@ def test_nothing_is_remembered_of_pieces_that_are_done():
     flight.submit(works(6))
     assert len(list(flight.land())) == 6
     assert flight.tries == flight.flying == {}
+
+
+def test_records_share_their_words():
+    """A driver keeps a record of each chunk of a country."""
+    stage = execute.Stage("classify", lambda url, job, fingerprint: {"status": "d" + "one"}, "", "t")
+    (_, a), (_, b) = execute.execute(Inline(), stage, works(2), ignore)
+    assert a["status"] is b["status"]
+    assert next(iter(a)) is next(iter(b))
