@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from functools import reduce
 
 import pytest
 from click.testing import CliRunner
 
 from ppdf_dask.cli.scale import scale as command
+from ppdf_dask.dtm import DtmGrid, Raster
 from ppdf_dask.experiments.processes import cluster
 from ppdf_dask.experiments.scale import PER_M2, TILE, ScaleTable, extent_of, measure
-from ppdf_dask.experiments.simulate import PER_TILE, country, simulate
+from ppdf_dask.experiments.simulate import PER_TILE, country, resolution, simulate
 from ppdf_dask.filters.cloud import Density
-from ppdf_dask.params import ChunkParams, RunParams
+from ppdf_dask.grid import Rect
+from ppdf_dask.params import ChunkParams, DtmParams, RunParams
 from ppdf_dask.plan import plan
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import scan
@@ -50,6 +53,13 @@ def test_a_country_is_planned_and_scheduled_with_records_of_every_task(tmp_path)
     assert found.tasks == sum(int(s["tasks"]) for s in found.stages.values())
     assert not (tmp_path / "simulated").exists()
     assert f"{found.chunks:,} chunks" in found.markdown()
+
+
+@pytest.mark.parametrize("chunks", [20_000, 150_000, 1_000_000])
+def test_a_terrain_model_of_the_simulated_country_is_not_refused(chunks):
+    grid = DtmGrid.from_params(DtmParams(resolution=resolution(chunks)))
+    places = [tile.bounds for tile in country(chunks).tiles]
+    Raster.over(grid, reduce(Rect.union, places))
 
 
 @pytest.mark.parametrize("points", [1e6, 10e6, 40e6, 160e6, 640e6])

@@ -5,6 +5,7 @@ Tiles are made up, 10 chunks each; every record a real task would publish is pub
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Iterable
@@ -12,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ppdf_dask.dtm import MAX_PIXELS
 from ppdf_dask.execute import Stage, Work, execute
 from ppdf_dask.experiments.processes import Usage, Watch, cluster
 from ppdf_dask.grid import MM, Rect
 from ppdf_dask.ledger import Ledger
-from ppdf_dask.params import ChunkParams, RunParams
+from ppdf_dask.params import ChunkParams, DtmParams, RunParams
 from ppdf_dask.quarantine import Failure
 from ppdf_dask.stages import Cutting, Inputs, Records
 from ppdf_dask.store import RunStore
@@ -97,6 +99,18 @@ def country(chunks: int) -> Survey:
     return Survey(tuple(_tile(k, columns) for k in range(columns * -(-tiles // columns))), "/pretended", None, 1.0, 1.0)
 
 
+def resolution(chunks: int) -> float:
+    """Return the least whole metres at which so many chunks have a terrain model that is not refused.
+
+    Examples
+    --------
+    >>> resolution(20_000), resolution(1_000_000)
+    (1.0, 3.0)
+    """
+    # Whole blocks are counted, and the country is made of whole rows.
+    return float(math.ceil((1.1 * chunks * CHUNK**2 / MAX_PIXELS) ** 0.5))
+
+
 def _tile(k: int, columns: int) -> Tile:
     x, y = k % columns * PER_TILE * CHUNK * MM, k // columns * CHUNK * MM
     return Tile(
@@ -130,7 +144,8 @@ def simulate(chunks: int, folder: Path, workers: int) -> Simulated:
     stages: dict[str, dict[str, float]] = {}
     with cluster(workers) as (client, pids), Watch(pids) as watch:
         begin = time.perf_counter()
-        made = plan(country(chunks), RunParams(chunks=ChunkParams(chunk_size=CHUNK)), out=out, memory=4e9)
+        params = RunParams(chunks=ChunkParams(chunk_size=CHUNK), dtm=DtmParams(resolution=resolution(chunks)))
+        made = plan(country(chunks), params, out=out, memory=4e9)
         expected = len(made.chunks)
         planned = time.perf_counter() - begin
         store = RunStore(str(out / "run.zarr"))
