@@ -20,14 +20,21 @@ from ppdf_dask.errors import ClusterError
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
 
-SINGLE = {
+ENVIRONMENT = {
     "NUMBA_NUM_THREADS": "1",
     "RAYON_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_MMAP_THRESHOLD_": "8388608",
+    "MALLOC_TRIM_THRESHOLD_": "33554432",
 }
-"""Environment of a worker: parallelism comes from processes alone, so threads must not multiply inside."""
+"""Environment of a worker.
+
+Parallelism comes from processes alone, so threads must not multiply inside. Dask's own threshold of 64 KiB makes glibc
+give each array back at once and fetch its pages anew: a tenth of a run's processor time. With these it keeps up to
+32 MiB and what lies between arrays of less than 8 MiB: a tenth more memory at the peak.
+"""
 
 ENCRYPTED = ("tls", "wss", "inproc")
 """Kinds of address that nobody on the way can read."""
@@ -69,7 +76,7 @@ def local_cluster(workers: int | None = None) -> Iterator[Client]:
     count = workers or default_workers()
     before = dask.config.get("distributed.nanny.pre-spawn-environ")
     config = {
-        "distributed.nanny.pre-spawn-environ": {**before, **SINGLE},
+        "distributed.nanny.pre-spawn-environ": {**before, **ENVIRONMENT},
         "distributed.worker.daemon": True,
         # Dask gives up a worker's place for good when it is empty 15 seconds after a death, also when the next worker
         # died meanwhile or starts slowly on a busy machine: in the end nobody is left and the run waits for ever.

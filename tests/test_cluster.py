@@ -65,8 +65,10 @@ def test_nobody_answers(monkeypatch):
         pass
 
 
-def test_what_we_start_listens_on_loopback_only():
+def test_what_we_start_listens_on_loopback_only_and_keeps_its_memory(monkeypatch):
+    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "1000000")  # what the user sets goes before
     with cluster.local_cluster(1) as client:
+        (found,) = client.run(lambda: dict(os.environ)).values()
         info = client.scheduler_info()
         addresses = [info["address"], *info["workers"], *(w["nanny"] for w in info["workers"].values())]
         ports = {int(a.rsplit(":", 1)[1]) for a in addresses} | set(info["services"].values())
@@ -75,6 +77,10 @@ def test_what_we_start_listens_on_loopback_only():
     assert all("//127.0.0.1:" in a for a in addresses)
     assert {address for address, port in heard if port in ports} == {"0100007F"}
     assert ports <= {port for _, port in heard}
+    assert {name: found[name] for name in cluster.ENVIRONMENT} == {
+        **cluster.ENVIRONMENT,
+        "MALLOC_TRIM_THRESHOLD_": "1000000",
+    }
 
 
 def listeners() -> set[tuple[str, int]]:

@@ -18,7 +18,7 @@ from rich.console import Console
 
 import ppdf_dask
 from ppdf_dask import preflight
-from ppdf_dask.cluster import SINGLE, dashboard
+from ppdf_dask.cluster import ENVIRONMENT, dashboard
 from ppdf_dask.progress import listen
 
 
@@ -50,7 +50,7 @@ def main() -> None:
         shared_temp_directory=str(private),
         log_directory=str(private),
         scheduler_options={"dashboard_address": "127.0.0.1:0"},
-        job_script_prologue=[f"export {name}={value}" for name, value in SINGLE.items()],
+        job_script_prologue=[f"export {name}={value}" for name, value in ENVIRONMENT.items()],
         # A worker leaves before its job is killed, so that nothing is blamed for it.
         worker_extra_args=[
             *("--lifetime", f"{max(options.minutes - 3, 1)}m", "--lifetime-stagger", "1m"),

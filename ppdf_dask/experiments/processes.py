@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -66,17 +66,28 @@ class Watch:
 
 
 @contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Give child processes started meanwhile what the user has not set."""
+    added = {name: value for name, value in values.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
+
+
+@contextmanager
 def cluster(workers: int) -> Iterator[tuple[Client, dict[str, list[int]]]]:
     """Start a scheduler and workers as processes of their own; give a client and the process ids by role."""
-    import dask
     from distributed import Client
     from distributed.deploy.subprocess import SubprocessCluster
 
-    from ppdf_dask.cluster import SINGLE, memory_per_worker
+    from ppdf_dask.cluster import ENVIRONMENT, memory_per_worker
 
-    before = dask.config.get("distributed.nanny.pre-spawn-environ")
+    # Such workers do not hear of this process's Dask configuration, but they get its environment.
     with (
-        dask.config.set({"distributed.nanny.pre-spawn-environ": {**before, **SINGLE}}),
+        _environment(ENVIRONMENT),
         SubprocessCluster(
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
