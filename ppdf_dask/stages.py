@@ -213,8 +213,8 @@ class Cutting:
 
     @cached_property
     def usual_points(self) -> float:
-        """Points above which a cloud with a wider buffer is cut: half as many again as in the largest first one."""
-        return max([SMALL, *(1.5 * self.index.loaded(chunk) for chunk in self.index.chunks)])
+        """Points above which a cloud with a wider buffer is cut: those of the largest first one."""
+        return max([SMALL, *(float(self.index.loaded(chunk)) for chunk in self.index.chunks)])
 
     def classify_works(self) -> list[Work]:
         """Return the work of the classify stage, densest chunk first."""
