@@ -103,6 +103,15 @@ def test_speed_table_without_memory(tile: Path) -> None:
     assert "\x1b" not in ran.stdout
 
 
+def test_the_first_call_in_a_process_is_measured_apart_from_the_imports(tile: Path) -> None:
+    options = ["--filter", "pmf", "--repeat", "1", "--no-memory", "--compilation", "--json"]
+    ran = CliRunner().invoke(group, ["benchmark", "speed", str(tile), *options])
+    assert ran.exit_code == 0, ran.output
+    (call,) = json.loads(ran.stdout)["first_call_s"].values()
+    assert set(call) == {"imports", "cold", "warm"}
+    assert min(call.values()) > 0
+
+
 def test_the_childs_last_words_are_told() -> None:
     with pytest.raises(PpdfError, match="no filter"):
         speed.child({"filter": "none", "profile": "x", "params": {}, "points": None})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -173,6 +173,23 @@ class FileSpeed:
 
 
 @dataclass(frozen=True)
+class FirstCall:
+    """What a filter's first call in a process takes, seconds.
+
+    Attributes
+    ----------
+    imports : float
+        Loading its modules, numba's among them.
+    cold, warm : float
+        Classifying a small cloud, with an empty and with a filled cache of kernels.
+    """
+
+    imports: float
+    cold: float
+    warm: float
+
+
+@dataclass(frozen=True)
 class SpeedTable:
     """All measurements of one run.
 
@@ -180,27 +197,27 @@ class SpeedTable:
     ----------
     files : tuple of FileSpeed
         One per file.
-    compilation : dict of str to (float, float)
-        Filter to the seconds its first call takes on a small cloud, with a cold and with a warm cache.
+    compilation : dict of str to FirstCall
+        By filter.
     """
 
     files: tuple[FileSpeed, ...]
-    compilation: dict[str, tuple[float, float]] = field(default_factory=dict)
+    compilation: dict[str, FirstCall] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
         return {
             "cpus": os.cpu_count(),
             "files": [f.as_dict() for f in self.files],
-            "first_call_s": {k: {"cold": a, "warm": b} for k, (a, b) in self.compilation.items()},
+            "first_call_s": {k: asdict(v) for k, v in self.compilation.items()},
         }
 
     def markdown(self) -> str:
         """Return two tables per file: ratios, and the filters' stages; compilation where it was measured."""
         parts = [text for f in self.files for text in (_ratios(f), *_stages(f))]
         if self.compilation:
-            rows = [[name, number(cold), number(warm)] for name, (cold, warm) in self.compilation.items()]
-            parts.append(markdown(["first call on a small cloud", "cold cache s", "warm cache s"], rows))
+            rows = [[k, number(v.imports), number(v.cold), number(v.warm)] for k, v in self.compilation.items()]
+            parts.append(markdown(["first call on a small cloud", "imports s", "cold cache s", "warm cache s"], rows))
         return "\n\n".join(parts)
 
 
@@ -358,12 +375,12 @@ def _summary(records: list[Recorder], peak: Mapping[str, int], offered: int) -> 
     )
 
 
-def compilation(choice: Choice) -> tuple[float, float]:
-    """Return the seconds of a filter's first call on a small cloud, with an empty and with a filled kernel cache."""
+def compilation(choice: Choice) -> FirstCall:
+    """Measure a filter's first call on a small cloud, with an empty and with a filled kernel cache."""
     asked = {"filter": choice.filter, "profile": choice.profile, "params": choice.params.as_dict(), "points": None}
     with tempfile.TemporaryDirectory() as folder:
-        cold, warm = (child(asked, {"NUMBA_CACHE_DIR": folder})["first"] for _ in range(2))
-    return cold, warm
+        cold, warm = (child(asked, {"NUMBA_CACHE_DIR": folder}) for _ in range(2))
+    return FirstCall(warm["imports"], cold["first"], warm["first"])
 
 
 def synthetic_files(folder: Path) -> list[Path]:
