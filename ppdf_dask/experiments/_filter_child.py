@@ -1,9 +1,9 @@
 """Measure one filter's compilation and peak memory in a process of its own; run by `ppdf_dask.experiments.speed`.
 
 Reads one JSON line: ``filter``, ``profile``, ``params``, ``origin`` and ``points``, the name of a file of int32
-millimetres of shape (3, n), or null. Writes one JSON line: ``imports`` (seconds until the modules are loaded), ``first``
-(seconds of the first call, on a small cloud, compilation included) and ``bytes`` (growth of the resident size while the whole cloud is classified; null where there
-is no cloud or the system does not tell).
+millimetres of shape (3, n), or null. Writes one JSON line: ``imports`` (seconds until the modules are loaded),
+``first`` (seconds of the first call, on a small cloud, compilation included) and ``bytes`` (growth of the resident
+size while the whole cloud is classified; null where there is no cloud or the system does not tell).
 """
 
 from __future__ import annotations
