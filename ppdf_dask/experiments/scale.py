@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -351,11 +352,11 @@ def study(sizes: list[float], workers: list[int], folder: Path, params: RunParam
         warm = make_survey(client, folder / "warm", WARM_UP, 125)
         tiles = {points: make_survey(client, folder, extent_of(points)) for points in sizes}
     rows = []
-    for count in workers:
+    for count, (points, place) in product(workers, places.items()):
+        # And so would what a smaller survey leaves.
         with cluster(count) as (client, pids):
             for _ in range(2):
                 measure(client, pids, warm, folder / "warm", params)
-            for points, place in places.items():
-                rows.append(measure(client, pids, tiles[points], place, params))
-                tick(f"{points / 1e6:g} million points, {count} workers")
+            rows.append(measure(client, pids, tiles[points], place, params))
+            tick(f"{points / 1e6:g} million points, {count} workers")
     return ScaleTable(tuple(sorted(rows, key=lambda r: (r.points, r.workers))))
