@@ -24,8 +24,9 @@ def _squared(ax, ay, bx, by):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def crop(points, shift_x, shift_y, box, out, end):  # type: ignore[no-untyped-def]
-    """Append the shifted points, (3, n), that lie in the closed box to the rows of `out`; return their new number."""
+def crop(points, shift_x, shift_y, box, out):  # type: ignore[no-untyped-def]
+    """Write the shifted points, (3, n), that lie in the closed box to the first rows of `out`; return their number."""
+    end = 0
     for i in range(points.shape[1]):
         x, y = points[0, i] + shift_x, points[1, i] + shift_y
         if box[0] <= x <= box[2] and box[1] <= y <= box[3]:

@@ -342,7 +342,7 @@ class _Tin:
             # As large as if all were inside: what is never written costs nothing. Piece by piece, so that a loader need
             # not keep all its parts at once.
             piece = np.empty((part.points.shape[1], 3), dtype=np.int32)
-            pieces.append(piece[: crop(part.points, part.x - self.x, part.y - self.y, box, piece, 0)])
+            pieces.append(piece[: crop(part.points, part.x - self.x, part.y - self.y, box, piece)])
         return np.concatenate(pieces)
 
     def insert(self, local: NDArray[np.int32]) -> None:

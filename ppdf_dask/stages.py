@@ -214,7 +214,7 @@ class Cutting:
     @cached_property
     def usual_points(self) -> float:
         """Points above which a cloud with a wider buffer is cut: those of the largest first one."""
-        return max([SMALL, *(float(self.index.loaded(chunk)) for chunk in self.index.chunks)])
+        return max([SMALL, *map(self.index.loaded, self.index.chunks)])
 
     def classify_works(self) -> list[Work]:
         """Return the work of the classify stage, densest chunk first."""

@@ -18,6 +18,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from ppdf_dask.cluster import ENVIRONMENT
+
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
 MANIFESTS = sorted((DEPLOY / "kubernetes").glob("*.yaml"))
@@ -33,6 +35,12 @@ def schemas() -> Path:
 
 def documents(path: Path) -> list[dict]:
     return list(yaml.safe_load_all(path.read_text()))
+
+
+@pytest.mark.parametrize("recipe", ["slurm/runner.sbatch", "docker/Dockerfile"])
+def test_workers_of_a_recipe_have_the_environment_of_our_own(recipe):
+    text = (DEPLOY / recipe).read_text().split()
+    assert {f"{name}={value}" for name, value in ENVIRONMENT.items()} <= set(text)
 
 
 def test_manifests_match_the_operators_own_definitions(schemas):

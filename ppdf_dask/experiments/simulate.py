@@ -100,7 +100,7 @@ def country(chunks: int) -> Survey:
 
 
 def resolution(chunks: int) -> float:
-    """Return the least whole metres at which so many chunks have a terrain model that is not refused.
+    """Return the least whole metres at which so many chunks have a terrain model that is not refused, a tenth to spare.
 
     Examples
     --------

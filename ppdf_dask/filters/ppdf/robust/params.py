@@ -56,7 +56,7 @@ class RobustParams(Parameters):
     border_gentle : float
         What a border counts that falls step by step, like an embankment's, instead of at once like a wall.
     passes : int
-        Passes of growth.
+        Passes of growth. What then stands 4 m above its references (`growth.TOO_HIGH`) is not tried again.
     growth_base, growth_spread, growth_slope : float
         b, k, q of growth over the cells.
     growth_step : float
