@@ -26,6 +26,7 @@ ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "1",
     "MALLOC_MMAP_THRESHOLD_": "8388608",
     "MALLOC_TRIM_THRESHOLD_": "33554432",
 }
@@ -33,7 +34,8 @@ ENVIRONMENT = {
 
 Parallelism comes from processes alone, so threads must not multiply inside. Dask's own threshold of 64 KiB makes glibc
 give each array back at once and fetch its pages anew: a tenth of a run's processor time. With these it keeps up to
-32 MiB and what lies between arrays of less than 8 MiB: a tenth more memory at the peak.
+32 MiB and what lies between arrays of less than 8 MiB, once per process: with an arena for each of a worker's threads,
+what one has freed is lost to the others.
 """
 
 ENCRYPTED = ("tls", "wss", "inproc")

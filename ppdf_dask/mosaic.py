@@ -39,8 +39,8 @@ _COG_OPTIONS = {
 }
 
 
-_GDAL_CACHE_MB = 128
-"""GDAL would take 5 % of the machine's memory in each worker."""
+_GDAL_CACHE_MB = 16
+"""GDAL would take 5 % of the machine's memory; a block is written once and read twice, so there is little to keep."""
 
 
 def raster_attributes(params: DtmParams, unit_z: float = 1.0) -> dict[str, dict[str, Any]]:

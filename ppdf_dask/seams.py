@@ -23,7 +23,7 @@ from ppdf_dask.grid import MM, Chunk, Rect
 from ppdf_dask.index import fragments
 from ppdf_dask.neighbourhood import crop, inside, join, overlap
 from ppdf_dask.saved import load_plan, refuse_other_code
-from ppdf_dask.solve import NARROW, ClassifyJob
+from ppdf_dask.solve import ClassifyJob, widened
 from ppdf_dask.stages import Cutting, Inputs
 from ppdf_dask.store import RunStore
 
@@ -195,7 +195,7 @@ def _answer(store: RunStore, job: ClassifyJob, band: int) -> tuple[Labels, int]:
         verdict = chosen.classify(cloud, job.filter)
         if not verdict.unproven.any() or cloud.known is None or width >= job.max_buffer:
             break
-        width = min(2 * max(width, NARROW), job.max_buffer)
+        width = widened(width, first=width == job.buffer - band, most=job.max_buffer)
     n, home = cloud.n_core, job.chunk.core
     ground = verdict.ground if cloud.fixed is None else verdict.ground | cloud.fixed[:n]
     rows = np.array([cloud.x[:n], cloud.y[:n], cloud.z[:n], ground], np.int64)
