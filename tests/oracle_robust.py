@@ -46,17 +46,22 @@ def classify(points, params):
             slack = lambda cell: params.fine_roughness * (rough[coarse(cell)] * 1e-3)  # noqa: E731
             new, more = grow(low, refs, soft, roofs | high, size, radius, rule, slack)
             refs, high = refs | new, high | more
+    blocks = {}
+    for i, j in refs:
+        blocks.setdefault((i // 4, j // 4), []).append(low[i, j][2])
     return [
-        label(
+        (p[0] // c, p[1] // c) in coarse_low
+        and p not in removed
+        and label(
             p,
             points_low=low,
             refs=refs,
+            high=high - refs,
+            blocks=blocks,
             c=size,
             radius=radius,
             params=params,
-            removed=removed,
             rough=rough[p[0] // c, p[1] // c],
-            empty=(p[0] // c, p[1] // c) not in coarse_low or (p[0] // size, p[1] // size) in high - refs,
         )
         for p in points
     ]
@@ -230,8 +235,8 @@ def raised(low, c, name, cells, patch, root, planes, params):
     return drops > params.border_share * borders
 
 
-def surface(p, low, refs, c, radius, own=None):
-    """Number of references, height above their surface, slope, distance and height above the nearest."""
+def quadrants(p, low, refs, c, radius, own=None):
+    """Squared distance, z, x, y of the nearest reference in each quadrant."""
     found = {}
     reach = ceil(radius / c) + 1
     for n in around(p[0] // c, p[1] // c, reach):
@@ -249,6 +254,11 @@ def surface(p, low, refs, c, radius, own=None):
                     quadrant = 1
                 key = dx * dx + dy * dy, z, x, y
                 found[quadrant] = min(found.get(quadrant, key), key)
+    return found
+
+
+def surface(p, found, c):
+    """Number of references, height above their surface, slope, distance and height above the nearest."""
     if not found:
         return 0, 0.0, 0.0, 0.0, 0.0
     d2, z, _, _ = min(found.values())
@@ -294,7 +304,7 @@ def grow(low, refs, soft, passed_over, c, radius, rule, slack):
     base, spread, factor, near, highest = rule
     new, high = set(), set()
     for cell in low.keys() - refs - passed_over:
-        n, r, slope, d, step = surface(low[cell], low, refs, c, radius, cell)
+        n, r, slope, d, step = surface(low[cell], quadrants(low[cell], low, refs, c, radius, cell), c)
         rise = base + (spread + factor * slope) * d
         by_plane = -(8.0 + 0.15 * d) < r < min(highest, rise + slack(cell))
         by_step = r > 0.0 and step < near + spread * d and cell not in soft
@@ -308,7 +318,7 @@ def grow(low, refs, soft, passed_over, c, radius, rule, slack):
 def clean(low, refs, c, radius, drop):
     kept, residual = set(), {}
     for cell in refs:
-        n, r, slope, d, _ = surface(low[cell], low, refs, c, radius, cell)
+        n, r, slope, d, _ = surface(low[cell], quadrants(low[cell], low, refs, c, radius, cell), c)
         if n >= 3 and drop and r > 0.3 + (0.2 + 1.2 * slope) * d:
             continue
         kept.add(cell)
@@ -322,14 +332,20 @@ def roughness(cell, residual):
     return sum(below_it) // len(below_it) if below_it else 0
 
 
-def label(p, points_low, refs, c, radius, params, removed, rough, empty):
-    cell = p[0] // c, p[1] // c
-    if empty or p in removed:
+def label(p, points_low, refs, high, blocks, c, radius, params, rough):
+    i, j = cell = p[0] // c, p[1] // c
+    if points_low[cell] == p and cell in refs:
+        return True
+    only_cliff = points_low[cell] == p or p[2] - points_low[cell][2] >= 5000 or cell in high
+    near = [z for n in around(i // 4, j // 4, 1) for z in blocks.get(n, [])]
+    if only_cliff and not (near and max(near) - min(near) > 5000 and p[2] <= max(near)):
         return False
-    if points_low[cell] == p:
-        return cell in refs
-    if p[2] - points_low[cell][2] >= 5000:
+    found = quadrants(p, points_low, refs, c, radius)
+    n, r, slope, d, _ = surface(p, found, c)
+    if n == 0 or r <= -(3.0 + slope * d):
         return False
-    n, r, slope, d, _ = surface(p, points_low, refs, c, radius)
+    levels = [z for _, z, _, _ in found.values()]
+    if slope > 1.0 and max(levels) - min(levels) > 5000 and p[2] <= max(levels):
+        return True
     tolerance = min(4.0 * params.tolerance, params.tolerance + params.roughness * rough * 1e-3)
-    return n > 0 and -(3.0 + slope * d) < r < tolerance + (params.label_spread + params.label_slope * slope) * d
+    return not only_cliff and r < tolerance + (params.label_spread + params.label_slope * slope) * d

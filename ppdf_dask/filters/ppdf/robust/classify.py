@@ -10,6 +10,7 @@ import numpy.typing as npt
 from ppdf_dask.filters.cloud import Cloud, Verdict
 from ppdf_dask.filters.ppdf.robust import cells as cells_
 from ppdf_dask.filters.ppdf.robust.cells import Cells
+from ppdf_dask.filters.ppdf.robust.cliffs import cliff_tops
 from ppdf_dask.filters.ppdf.robust.fine import halve
 from ppdf_dask.filters.ppdf.robust.growth import clean, grow
 from ppdf_dask.filters.ppdf.robust.label import label
@@ -247,6 +248,7 @@ def _label(
         params.roughness,
         params.label_spread,
         params.label_slope,
+        cliff_tops(width, pos, state),
         room_for_index(len(state)),
         ground,
         unproven,

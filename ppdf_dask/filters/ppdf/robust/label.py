@@ -8,8 +8,12 @@ import numpy as np
 from numba import njit
 
 from ppdf_dask.filters.ppdf.robust.cells import HIGH, LOW, REF, UNPROVEN
+from ppdf_dask.filters.ppdf.robust.cliffs import BLOCK, at_cliff
 from ppdf_dask.filters.ppdf.robust.growth import NOT_KNOWN
 from ppdf_dask.filters.ppdf.robust.surface import count_within, height_above, index_references, nearest, reach
+
+FAR_ABOVE = 5_000
+"""Millimetres above its cell's low point from where a point is sought nowhere but at cliffs."""
 
 
 @njit(nogil=True, cache=True)
@@ -36,6 +40,7 @@ def label(
     rough_factor: Any,
     spread: Any,
     slope_factor: Any,
+    tops: Any,
     index: Any,
     ground: Any,
     unproven: Any,
@@ -43,7 +48,8 @@ def label(
     """Set `ground` and `unproven` of the core points.
 
     `of_point`, `floor`, `known` (their states) and `rough` speak of the coarse cells; `width`, `cell`, `pos` and
-    `state` of the fine ones, `parts` x `parts` to a coarse one; `index` is room for `index_references`.
+    `state` of the fine ones, `parts` x `parts` to a coarse one; `tops` is of `cliff_tops`, `index` room for
+    `index_references`.
     """
     right, left, open_ = index
     index_references(width, state, right, left, open_)
@@ -66,24 +72,30 @@ def label(
         k = big
         if parts > 1:
             k = yi // cell * width + xi // cell
-        if zi == pos[k, 2] and xi == pos[k, 0] and yi == pos[k, 1]:
-            ground[i] = (state[k] & REF) != 0
-            unproven[i] = (state[k] & UNPROVEN) != 0
-            continue
-        if zi - pos[k, 2] >= 5000 or state[k] & HIGH:
-            continue
+        is_low = zi == pos[k, 2] and xi == pos[k, 0] and yi == pos[k, 1]
+        unknown = is_low and (state[k] & UNPROVEN) != 0
+        only_cliff = is_low or zi - pos[k, 2] >= FAR_ABOVE or (state[k] & HIGH) != 0
+        if only_cliff:
+            b = k // width // BLOCK * (width // BLOCK) + k % width // BLOCK
+            ground[i] = is_low and (state[k] & REF) != 0
+            if ground[i] or zi > tops[b, 0]:
+                unproven[i] = unknown
+                continue
+            unknown |= tops[b, 1] != 0
         fx, fy = xi % cell, yi % cell
         nearest(right, left, pos, width, cell, k, xi, yi, fx, fy, limit2, found)
-        unknown = False
         if not all_known:
             ring = reach(found, fx, fy, cell, rings)
-            unknown = count_within(open_, width, k, ring) > 0
+            unknown |= count_within(open_, width, k, ring) > 0
         n, r, slope, d, _step = height_above(pos, xi, yi, zi, found, soft)
         if n > 0 and r > -(3.0 + slope * d):
-            rise = (spread + slope_factor * slope) * d
-            if rough[big] == NOT_KNOWN:
-                ground[i] = r < tolerance + rise
-                unknown |= ground[i] != (r < 4.0 * tolerance + rise)
-            else:
-                ground[i] = r < min(4.0 * tolerance, tolerance + rough_factor * rough[big] * 1e-3) + rise
+            if at_cliff(pos, zi, found, slope):
+                ground[i] = True
+            elif not only_cliff:
+                rise = (spread + slope_factor * slope) * d
+                if rough[big] == NOT_KNOWN:
+                    ground[i] = r < tolerance + rise
+                    unknown |= ground[i] != (r < 4.0 * tolerance + rise)
+                else:
+                    ground[i] = r < min(4.0 * tolerance, tolerance + rough_factor * rough[big] * 1e-3) + rise
         unproven[i] = unknown

@@ -1,0 +1,76 @@
+"""Cliffs: where the references around a place stand high above each other (step 11).
+
+No roof is a reference; what stands as high as a reference beside it, where the ground itself breaks off, is its rim or
+its face, however high above the plane through top and foot.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from ppdf_dask.filters.ppdf.compiled import leaf
+from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
+
+BLOCK = 4
+"""Cells along the edge of a block of `cliff_tops`; squares hold whole blocks, so that these hang at absolute places."""
+
+HEIGHT = 5_000
+"""Millimetres by which the references at a cliff differ."""
+
+STEEP = 1.0
+"""Slope from where their surface is a cliff's: no seed is steeper."""
+
+NO_CLIFF = np.int32(-(2**31))
+NOWHERE = np.int32(2**31 - 1)
+
+
+def cliff_tops(width: int, pos: npt.NDArray[np.int32], state: npt.NDArray[np.uint8]) -> npt.NDArray[np.int32]:
+    """Return for each block of cells the height (mm) above which nothing far above the ground belongs to a cliff.
+
+    That of the highest reference of the block and the eight around it, `NO_CLIFF` where these do not differ by more
+    than `HEIGHT`; and not 0 where one of their cells is unproven: then all that might be a reference counts as one.
+    """
+    blocks = len(state) // BLOCK**2
+    spans, tops = np.empty((blocks, 3), np.int32), np.empty((blocks, 2), np.int32)
+    spans[:] = NOWHERE, NO_CLIFF, 0
+    tops[:] = NO_CLIFF, 0
+    _find_tops(width, pos, state, spans, tops)
+    return tops
+
+
+@njit(nogil=True, cache=True)
+def _find_tops(width: Any, pos: Any, state: Any, spans: Any, tops: Any) -> None:
+    wide = width // BLOCK
+    for k in range(len(state)):
+        s = state[k]
+        if s & (REF | UNPROVEN):
+            b = k // width // BLOCK * wide + k % width // BLOCK
+            spans[b, 0] = min(spans[b, 0], pos[k, 2] if s & LOW else NO_CLIFF)
+            spans[b, 1] = max(spans[b, 1], pos[k, 2] if s & LOW else NOWHERE)
+            spans[b, 2] |= s & UNPROVEN
+    for b in range(wide + 1, len(spans) - wide - 1):
+        bottom, top = np.int64(NOWHERE), np.int64(NO_CLIFF)
+        for start in range(b - wide - 1, b + wide, wide):
+            for j in range(start, start + 3):
+                bottom = min(bottom, np.int64(spans[j, 0]))
+                top = max(top, np.int64(spans[j, 1]))
+                tops[b, 1] |= spans[j, 2]
+        if top - bottom > HEIGHT:
+            tops[b, 0] = top
+
+
+@leaf
+def at_cliff(pos: Any, z: Any, found: Any, slope: Any) -> Any:
+    """Tell whether the references found make a cliff, and `z` lies no higher than one of them."""
+    if slope <= STEEP:
+        return False
+    bottom, top = np.int64(NOWHERE), np.int64(NO_CLIFF)
+    for q in range(4):
+        if found[q] >= 0:
+            height = np.int64(pos[found[q], 2])
+            bottom, top = min(bottom, height), max(top, height)
+    return z <= top and top - bottom > HEIGHT
