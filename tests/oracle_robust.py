@@ -221,6 +221,7 @@ def raised(low, c, name, cells, patch, root, planes, params):
         plane = planes[patch[i, j]]
         tilt = sqrt(plane[0] ** 2 + plane[1] ** 2)
         falls = steps = False
+        last, level, steepest = low[i, j], 0.0, 0.0
         for far in range(1, 13):
             n = i + far * dx, j + far * dy
             if n in patch and root(patch[n]) == name:
@@ -229,9 +230,13 @@ def raised(low, c, name, cells, patch, root, planes, params):
                 above = height(plane, low[n], c)
                 falls = above < -(params.border_drop + 0.5 * tilt * far * (c * 1e-3))
                 steps |= not falls and above < -0.5
+                along, across = (low[n][0] - last[0]) * 1e-3, (low[n][1] - last[1]) * 1e-3
+                steepest = max(steepest, (level - above) / sqrt(along * along + across * across))
+                last, level = low[n], above
         else:
+            slowly = steepest < 0.7 or (steps and steepest < 2.0)
             borders += 1
-            drops += falls * (params.border_gentle if steps else 1.0)
+            drops += falls * (params.border_gentle if slowly else 1.0)
     return drops > params.border_share * borders
 
 

@@ -103,6 +103,23 @@ def test_what_falls_at_once_is_a_building_what_falls_step_by_step_a_dam(flank, g
     assert found[(across > flank + 1) | (along > flank + 1)].mean() > 0.99
 
 
+def test_a_dam_across_few_points_falls_no_more_steeply_than_earth_lies():
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(0, 160, (2, 8000))
+    across, along = np.abs(x - y) / 2**0.5 - 4, np.abs(x + y - 160) / 2**0.5 - 75
+    z = 6.0 * np.clip(1 - np.maximum(across, along) / 9, 0, 1) + rng.normal(0, 0.03, len(x))
+    crest = (across < -1) & (along < -1)
+    assert classify_ground(np.column_stack([x, y, z]))[crest].mean() > 0.9
+
+
+def test_a_ledge_partway_down_a_wall_makes_no_dam_of_a_building():
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(0, 160, (2, 6400))
+    out = np.maximum(np.abs(x - 80), np.abs(y - 80))
+    z = np.where(out < 14, 15.0, np.where(out < 18, 13.8, 0.0)) + rng.normal(0, 0.03, len(x))
+    assert not classify_ground(np.column_stack([x, y, z]))[out < 13].any()
+
+
 def test_the_rim_of_a_cliff_is_ground_what_stands_beside_it_is_not():
     rng = np.random.default_rng(4)
     x, y = rng.uniform(0, 200, (2, 30_000))

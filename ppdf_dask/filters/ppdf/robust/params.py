@@ -54,7 +54,7 @@ class RobustParams(Parameters):
         A patch is a roof or a crown when along this share of its border a low point within `border_reach` m lies more
         than `border_drop` m (and half the plane's rise over the distance) below its plane.
     border_gentle : float
-        What a border counts that falls step by step, like an embankment's, instead of at once like a wall.
+        What a border counts that falls like an embankment's flank, instead of at once like a wall.
     passes : int
         Passes of growth. What then stands 4 m above its references (`growth.TOO_HIGH`) is not tried again.
     growth_base, growth_spread, growth_slope : float
@@ -95,7 +95,7 @@ class RobustParams(Parameters):
     border_drop: float = quantity(1.5, "m", low=0.0, high=100.0)
     border_reach: float = quantity(10.0, "m", low=0.0, high=100.0)
     border_share: float = quantity(0.45, "1", low=0.0, high=1.0)
-    border_gentle: float = quantity(0.5, "1", low=0.0, high=1.0)
+    border_gentle: float = quantity(0.3, "1", low=0.0, high=1.0)
     passes: int = quantity(8, "passes", low=0, high=100)
     growth_base: float = quantity(0.3, "m", low=0.0, high=10.0)
     growth_spread: float = quantity(0.1, "1", low=0.0, high=10.0)

@@ -14,6 +14,12 @@ from ppdf_dask.filters.ppdf.robust.planes import NOT_KNOWN_PATCH
 STEP = 0.5
 """Metres below a patch's plane at which a low point lies partway down."""
 
+HEAPED = 0.7
+"""Earth does not lie steeper than this (35 degrees): what nowhere falls more steeply is a flank."""
+
+WALL = 2.0
+"""What falls more steeply than this somewhere has a wall, whatever lies partway down."""
+
 
 @leaf
 def residual(planes: Any, squares: Any, p: Any, pos: Any, k: Any, cell: Any) -> Any:
@@ -109,8 +115,9 @@ def judge_components(
 ) -> None:
     """Drop the seeds of components that are too small or whose border drops away on most sides.
 
-    A wall falls at once; the flank of an embankment falls step by step. A direction in which a low point lies partway
-    down, more than `STEP` below the plane, before the drop counts as `gentle` of one.
+    A wall falls at once; the flank of an embankment falls step by step. A direction counts as `gentle` of one when it
+    falls no more steeply than earth lies (`HEAPED`), or when a low point lies partway down, more than `STEP` below the
+    plane, before the drop, and nowhere falls like a `WALL`.
     """
     seeds = np.zeros(count, np.int64)
     borders = np.zeros(count, np.int64)
@@ -139,7 +146,8 @@ def judge_components(
             inside = False
             falls = False
             steps = False
-            j = k
+            j = last = k
+            level = steepest = 0.0
             for far in range(1, look_out + 1):
                 j += shift[direction]
                 if patch[j] >= 0 and parent[patch[j]] == root:
@@ -152,10 +160,16 @@ def judge_components(
                     height = residual(planes, squares, p, pos, j, cell)
                     falls = height < -fall
                     steps |= not falls and height < -STEP
+                    along = (pos[j, 0] - pos[last, 0]) * 1e-3
+                    across = (pos[j, 1] - pos[last, 1]) * 1e-3
+                    steepest = max(steepest, (level - height) / np.sqrt(along * along + across * across))
+                    last = j
+                    level = height
             if not inside:
+                slowly = steepest < HEAPED or (steps and steepest < WALL)
                 borders[root] += 1
-                drops[root] += falls and not steps
-                slow[root] += falls and steps
+                drops[root] += falls and not slowly
+                slow[root] += falls and slowly
     verdict = np.zeros(count, np.uint8)
     for root in range(count):
         if parent[root] != root:
