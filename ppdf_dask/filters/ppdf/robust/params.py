@@ -54,7 +54,8 @@ class RobustParams(Parameters):
         A patch is a roof or a crown when along this share of its border a low point within `border_reach` m lies more
         than `border_drop` m (and half the plane's rise over the distance) below its plane.
     border_gentle : float
-        What a border counts that falls like an embankment's flank, instead of at once like a wall.
+        What a border counts that falls like an embankment's flank (`patches.HEAPED`, `patches.WALL`), instead of at
+        once like a wall.
     passes : int
         Passes of growth. What then stands 4 m above its references (`growth.TOO_HIGH`) is not tried again.
     growth_base, growth_spread, growth_slope : float
@@ -68,7 +69,8 @@ class RobustParams(Parameters):
     fine_roughness : float
         How many times the local roughness is added to `fine_base`.
     label_spread, label_slope : float
-        k, q of the final labels.
+        k, q of the final labels. At cliffs (`cliffs.HEIGHT`, `cliffs.STEEP`) all is ground that lies no higher than the
+        references around it.
     steps : tuple of str
         The steps to take, a subset of ``STEPS``; for ablations.
 
