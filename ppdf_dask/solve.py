@@ -27,8 +27,8 @@ FIRST_STEP, NEXT_STEPS = 2.5, 1.5
 """What a buffer grows by, first and then.
 
 Where a proof fails, a patch mostly is cut by the area's edge, and that is settled once all of it is inside: of 24 such
-places in a forest, 20 needed at most 2.5 times the first guess of 82 m, and none 4 times as much. Doubling loads more
-points in every cloud tried, up to one and a half times as many (`ppdf-dask benchmark proof`).
+places in a forest, 20 needed at most 2.5 times the first guess of 82 m, and none 4 times as much. Doubling loads a
+third more points in re-runs there; only with chunks as small as 150 m a little fewer (`ppdf-dask benchmark proof`).
 """
 
 
