@@ -23,6 +23,7 @@ _EVLR = struct.Struct("<H16sHQ32s")
 _MAX_RECORDS = 10_000
 _MAX_CRS = 1 << 20
 _LARGEST = 1e12
+_POINT10, _POINT14 = 6, 10  # LASzip's kinds of items
 _POINTS_PER_BYTE = 10_000  # identical points compress to about 100 per byte; nothing real comes near this
 
 WKT, GEO_KEYS = 2112, 34735
@@ -353,7 +354,10 @@ def _laszip(draft: _Draft, offset: int, record_length: int, count: int) -> Laszi
     kinds = [struct.unpack_from("<HHH", record, 34 + 6 * k) for k in range(items)]
     if sum(length for _, length, _ in kinds) != record_length:
         raise Reject("laszip-vlr", f"has a laszip VLR that does not add up to its {record_length} bytes per point")
-    layers = sum({10: 9, 11: 1, 12: 2, 13: 1, 14: length}.get(kind, 0) for kind, length, _ in kinds)
+    # Coordinates and classes are in the first item; a decompressor takes a list without it, and its layers for others.
+    if kinds[0][0] != (_POINT14 if compressor == 3 else _POINT10):
+        raise Reject("laszip-vlr", f"has a laszip VLR whose items begin with kind {kinds[0][0]}, which is no point")
+    layers = sum({_POINT14: 9, 11: 1, 12: 2, 13: 1, 14: length}.get(kind, 0) for kind, length, _ in kinds)
     variable = chunk_size == 0xFFFFFFFF
     table, chunks = _chunk_table(draft, offset, record_length)
     room = table - offset - 8

@@ -59,8 +59,6 @@ def can_relabel(header: Header, most_points: int) -> bool:
     laszip = header.laszip
     if laszip is None or not laszip.layered or laszip.chunk_size is None or header.version != "1.4":
         return False
-    if laszip.layers < _LAYERS:  # A damaged list of items may leave out the points themselves.
-        return False
     tidy = not _UNTIDY.intersection(code for code, _ in header.warnings)
     apart = header.evlr_count == 0 or header.evlrs[0] > laszip.table
     small = max(header.offset_to_points, header.evlrs[1] - header.evlrs[0]) <= _LARGE

@@ -250,6 +250,7 @@ BROKEN = [
     broken("chunks of 0 points", ".laz", poke_laszip(12, "I", 0), "laszip-vlr"),
     broken("thousands of items", ".laz", poke_laszip(32, "H", 65535), "laszip-vlr"),
     broken("items that do not add up", ".laz", poke_laszip(36, "H", 31), "laszip-vlr"),
+    broken("items without points", ".laz", poke_laszip(34, "H", 14), "laszip-vlr"),
     broken("billions of chunks", ".laz", poke_table(4, "I", 2**32 - 1), "chunk-table"),
     broken("chunk table at a negative place", ".laz", lambda p: patch(p, peek(p, 96, "I"), "q", -7), "chunk-table"),
     broken("scale 0", ".las", poke(SCALES, "d", 0.0), "scale"),
