@@ -10,8 +10,12 @@ from ppdf_dask.errors import ParameterError
 from ppdf_dask.filters import classify_ground, get
 from ppdf_dask.filters.cloud import Cloud, Density, cloud_from_grid
 from ppdf_dask.filters.ppdf.robust import windows
+from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
 from ppdf_dask.filters.ppdf.robust.classify import classify
+from ppdf_dask.filters.ppdf.robust.cliffs import cliff_tops
+from ppdf_dask.filters.ppdf.robust.label import label
 from ppdf_dask.filters.ppdf.robust.params import STEPS, RobustParams
+from ppdf_dask.filters.ppdf.robust.surface import room_for_index
 from ppdf_dask.grid import Rect
 
 SMALL = RobustParams(cell_size=1.0, refinement=1, search_radius=6.0, largest_building=24.0, passes=3)
@@ -132,6 +136,52 @@ def test_the_rim_of_a_cliff_is_ground_what_stands_beside_it_is_not():
     rim = (from_edge > 0) & (from_edge < 6) & ~tree & ~house
     assert found[rim].mean() > 0.88  # without the rule of cliffs 0.82
     assert not found[house | tree].any()
+
+
+@pytest.mark.parametrize(("far", "ground"), [("reference", True), ("none", False), ("unproven", None)])
+def test_a_cliff_that_hangs_on_an_unproven_cell_is_unproven(far, ground):
+    """The cell at (39, 39) decides whether there is a cliff in the blocks around, beyond all that the search sees."""
+    width, cell, height = 64, 1000, 6000
+    row, col = np.divmod(np.arange(width * width, dtype=np.int32), width)
+    pos = np.stack([col * cell + 500, row * cell + 500, np.zeros_like(row)], axis=1).astype(np.int32)
+    state = np.full(len(pos), LOW, np.uint8)
+    for r, c, top in ((31, 27, 0), (33, 27, 0), (31, 37, 20_000), (33, 37, 20_000)):
+        state[r * width + c] |= REF
+        pos[r * width + c, 2] = top
+    state[39 * width + 39] |= {"reference": REF, "none": 0, "unproven": UNPROVEN}[far]
+    k = 32 * width + 32
+    x, y, z = (np.array([v], np.int32) for v in (*pos[k, :2], height))
+    found, unproven = np.empty(1, np.bool_), np.empty(1, np.bool_)
+    label(
+        x,
+        y,
+        z,
+        np.empty(0, np.bool_),
+        1,
+        0,
+        0,
+        np.array([k], np.int32),
+        np.full(len(pos), -1, np.int32),
+        state,
+        np.zeros(len(pos), np.int32),
+        1,
+        width,
+        cell,
+        pos,
+        state,
+        25,
+        25_000**2,
+        0.2,
+        0.65,
+        0.1,
+        0.45,
+        cliff_tops(width, pos, state),
+        room_for_index(len(state)),
+        found,
+        unproven,
+    )
+    assert unproven[0] == (ground is None)
+    assert ground is None or found[0] == ground
 
 
 def test_a_decreed_point_in_a_square_that_is_not_known_proves_nothing_about_its_patch():
