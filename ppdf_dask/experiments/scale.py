@@ -351,10 +351,11 @@ class ScaleTable:
 def study(sizes: list[float], workers: list[int], folder: Path, params: RunParams, tick: Tick) -> ScaleTable:
     """Measure all sizes with all numbers of workers; tiles and runs stay in `folder`."""
     places = {points: folder / f"{points / 1e6:g}M" for points in sizes}
-    # By workers of their own: what generating leaves in a process would count as memory of the job.
-    with cluster(max(workers)) as (client, _):
+    # By workers of their own: what generating and compiling leave in a process would count as memory of the job.
+    with cluster(max(workers)) as (client, pids):
         warm = make_survey(client, folder / "warm", WARM_UP, 125)
         tiles = {points: make_survey(client, folder, extent_of(points)) for points in sizes}
+        measure(client, pids, warm, folder / "warm", params)
     rows = []
     for count, (points, place) in product(workers, places.items()):
         # And so would what a smaller survey leaves.
