@@ -26,9 +26,9 @@ NARROW = 10_000
 FIRST_STEP, NEXT_STEPS = 2.5, 1.5
 """What a buffer grows by, first and then.
 
-Where a proof fails, a patch mostly is cut by the area's edge, and that is settled once all of it is inside: of 24 such
-places in a forest, 20 needed at most 2.5 times the first guess of 82 m, and none 4 times as much. Doubling loads a
-third more points in re-runs there; only with chunks as small as 150 m a little fewer (`ppdf-dask benchmark proof`).
+Where a proof fails, a patch mostly is cut by the area's edge, and nothing is won before all of it is inside. With the
+planner's chunks these steps load fewer points than doubling, with chunks of 150 m some more (`ppdf-dask benchmark
+proof`, README).
 """
 
 
