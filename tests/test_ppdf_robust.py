@@ -12,10 +12,11 @@ from ppdf_dask.filters.cloud import Cloud, Density, cloud_from_grid
 from ppdf_dask.filters.ppdf.robust import windows
 from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
 from ppdf_dask.filters.ppdf.robust.classify import classify
-from ppdf_dask.filters.ppdf.robust.cliffs import cliff_tops
-from ppdf_dask.filters.ppdf.robust.label import label
+from ppdf_dask.filters.ppdf.robust.growth import References
+from ppdf_dask.filters.ppdf.robust.label import Points, Tolerance, label
+from ppdf_dask.filters.ppdf.robust.lanes import room_for_lanes
 from ppdf_dask.filters.ppdf.robust.params import STEPS, RobustParams
-from ppdf_dask.filters.ppdf.robust.surface import room_for_index
+from ppdf_dask.filters.ppdf.robust.surface import index_references, room_for_index
 from ppdf_dask.grid import Rect
 
 SMALL = RobustParams(cell_size=1.0, refinement=1, search_radius=6.0, largest_building=24.0, passes=3)
@@ -151,37 +152,14 @@ def test_a_cliff_that_hangs_on_an_unproven_cell_is_unproven(far, ground):
     state[39 * width + 39] |= {"reference": REF, "none": 0, "unproven": UNPROVEN}[far]
     k = 32 * width + 32
     x, y, z = (np.array([v], np.int32) for v in (*pos[k, :2], height))
-    found, unproven = np.empty(1, np.bool_), np.empty(1, np.bool_)
-    label(
-        x,
-        y,
-        z,
-        np.empty(0, np.bool_),
-        1,
-        0,
-        0,
-        np.array([k], np.int32),
-        np.full(len(pos), -1, np.int32),
-        state,
-        np.zeros(len(pos), np.int32),
-        1,
-        width,
-        cell,
-        pos,
-        state,
-        25,
-        25_000**2,
-        0.2,
-        0.65,
-        0.1,
-        0.45,
-        cliff_tops(width, pos, state),
-        room_for_index(len(state)),
-        found,
-        unproven,
-    )
-    assert unproven[0] == (ground is None)
-    assert ground is None or found[0] == ground
+    index = room_for_index(len(state))
+    index_references(width, cell, pos, state, index)
+    nothing, floor = np.zeros(len(pos), np.int32), np.full(len(pos), -1, np.int32)
+    points = Points(x, y, z, np.empty(0, np.bool_), 0, 0, np.array([k], np.int32), floor, state, nothing)
+    tolerance = Tolerance(0.2, 0.65, 0.1, 0.45)
+    got = label(points, 1, References(width, cell, pos, state, index), 25_000, tolerance, room_for_lanes())
+    assert got.unproven[0] == (ground is None)
+    assert ground is None or got.ground[0] == ground
 
 
 def test_a_decreed_point_in_a_square_that_is_not_known_proves_nothing_about_its_patch():

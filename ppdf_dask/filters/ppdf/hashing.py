@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from ppdf_dask.filters.ppdf.compiled import kernel
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -17,7 +18,7 @@ _M2 = np.uint64(0x94D049BB133111EB)
 _S27, _S30, _S31, _S32 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(32)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def mix(value: Any) -> Any:
     """Scramble 64 bits (SplitMix64's finalizer).
 
@@ -42,7 +43,7 @@ def mix(value: Any) -> Any:
     return v ^ (v >> _S31)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def cell_seed(ix: Any, iy: Any, size: Any) -> Any:
     """Return the seed that belongs to a square cell.
 
@@ -70,7 +71,7 @@ def cell_seed(ix: Any, iy: Any, size: Any) -> Any:
     return mix(seed + GOLDEN ^ np.uint64(iy))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def below(seed: Any, k: Any, n: Any) -> Any:
     """Draw the `k`-th number of a seed, an integer from 0 to `n` - 1.
 

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from ppdf_dask.filters.cloud import Cloud
-from ppdf_dask.filters.ppdf.compiled import leaf
+from ppdf_dask.filters.ppdf.compiled import kernel, leaf
 
 SQUARE = 16
 """Cells along the edge of the largest plane square."""
@@ -61,13 +60,13 @@ class Cells:
     state: npt.NDArray[np.uint8]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _locate(x: Any, y: Any, x0: Any, y0: Any, cell: Any, width: Any, of_point: Any) -> None:
     for i in range(len(x)):
         of_point[i] = (y[i] - y0) // cell * width + (x[i] - x0) // cell
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _lowest(x: Any, y: Any, z: Any, fixed: Any, x0: Any, y0: Any, of_point: Any, pos: Any, state: Any) -> None:
     for i in range(len(x)):
         k = of_point[i]
@@ -112,7 +111,7 @@ def _around(width: Any, pos: Any, state: Any, k: Any) -> Any:
     return n, third, unknown
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _flag_outliers(width: Any, pos: Any, floor: Any, state: Any, limit: Any, again: Any) -> None:
     """Mark in `again` the cells whose low point goes (1) or cannot be judged (2)."""
     for k in range(len(state)):
@@ -136,7 +135,7 @@ def _flag_outliers(width: Any, pos: Any, floor: Any, state: Any, limit: Any, aga
             floor[k] = min(third - limit, z + limit)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _next_lowest(
     x: Any, y: Any, z: Any, x0: Any, y0: Any, of_point: Any, pos: Any, floor: Any, state: Any, again: Any
 ) -> None:

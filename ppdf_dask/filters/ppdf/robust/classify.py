@@ -10,26 +10,17 @@ import numpy.typing as npt
 from ppdf_dask.filters.cloud import Cloud, Verdict
 from ppdf_dask.filters.ppdf.robust import cells as cells_
 from ppdf_dask.filters.ppdf.robust.cells import Cells
-from ppdf_dask.filters.ppdf.robust.cliffs import cliff_tops
 from ppdf_dask.filters.ppdf.robust.fine import halve
-from ppdf_dask.filters.ppdf.robust.growth import clean, grow
-from ppdf_dask.filters.ppdf.robust.label import label
+from ppdf_dask.filters.ppdf.robust.growth import References, Rule, candidates, clean, grow
+from ppdf_dask.filters.ppdf.robust.label import Points, Tolerance, label
+from ppdf_dask.filters.ppdf.robust.lanes import Room, room_for_lanes
 from ppdf_dask.filters.ppdf.robust.params import RobustParams
-from ppdf_dask.filters.ppdf.robust.patches import judge_components, link_patches, spread_roofs
+from ppdf_dask.filters.ppdf.robust.patches import LOOK_OUT, judge_components, link_patches, spread_roofs
 from ppdf_dask.filters.ppdf.robust.planes import find_planes
 from ppdf_dask.filters.ppdf.robust.roughness import local_roughness
-from ppdf_dask.filters.ppdf.robust.surface import room_for_index
+from ppdf_dask.filters.ppdf.robust.surface import index_references, room_for_index
 from ppdf_dask.filters.ppdf.robust.windows import fits_one_grid, in_windows
 from ppdf_dask.grid import MM
-
-LOOK_OUT = 12
-"""Cells: how far a seed looks for its own patch before it counts as border."""
-
-NEAR = 3
-"""Cells: low points of two patches so near vote on whether the patches are one surface."""
-
-AGREE = 1.0
-"""Metres: two low points agree when each lies this near to the other's plane."""
 
 CACHED_CELLS = 1 << 15
 """A larger grid does not fit a processor's cache: its points are taken row by row, whatever the file's order."""
@@ -106,195 +97,81 @@ def _classify_in_order(cloud: Cloud, params: RobustParams) -> Verdict:
         cells_.drop_low_outliers(cloud, cells)
     if "planes" in params.steps:
         _seed(cells, params)
-    state = _grow(cells, params) if "growth" in params.steps else cells.state
-    after, rough = np.empty_like(state), np.empty(len(state), np.int32)
-    residuals = np.empty(len(state), np.int32)
-    limit2 = round(params.search_radius * MM) ** 2
-    drop = "cleaning" in params.steps
-    clean(cells.width, cell, cells.pos, state, rings, limit2, drop, residuals, room_for_index(len(state)), after)
-    local_roughness(cells.width, cells.height, after, residuals, ROUGH_REACH, round(ROUGH_MOST * MM), rough)
-    return _label(cloud, cells, after, rough, params)
+    references, room = _references(cells, cells.state), room_for_lanes()
+    if "growth" in params.steps:
+        _grow(cells, references, params, room)
+    state, residuals = clean(references, round(params.search_radius * MM), "cleaning" in params.steps, room)
+    rough = local_roughness(cells.width, state, residuals, ROUGH_REACH, round(ROUGH_MOST * MM))
+    index_references(cells.width, cell, cells.pos, state, references.indexed)
+    return _label(cloud, cells, references._replace(state=state), rough, params, room)
+
+
+def _references(cells: Cells, state: npt.NDArray[np.uint8]) -> References:
+    """Return the grid with its references, indexed."""
+    index = room_for_index(len(state))
+    index_references(cells.width, cells.cell, cells.pos, state, index)
+    return References(cells.width, cells.cell, cells.pos, state, index)
 
 
 def _seed(cells: Cells, params: RobustParams) -> None:
     """Planes, their seeds, and the test that tells terrain from roofs and crowns (steps 4 to 6)."""
-    width, height, cell, pos, state = cells.width, cells.height, cells.cell, cells.pos, cells.state
-    lows = int(np.count_nonzero(state & cells_.LOW))
-    patch = np.full(len(state), -1, np.int32)
-    planes, squares = np.empty((lows, 3)), np.empty((lows, 4), np.int32)
-    count = find_planes(
-        width,
-        height,
-        cell,
-        pos,
-        state,
-        patch,
-        planes,
-        squares,
-        params.trials,
-        params.inlier_distance,
-        params.inlier_share,
-        params.division_distance,
-    )
-    if "roofs" not in params.steps:
-        return
-    parent, open_ = np.empty(count, np.int32), np.empty(count, np.bool_)
-    link_patches(width, cell, pos, state, patch, planes, squares, count, NEAR, AGREE, parent, open_)
-    judge_components(
-        width,
-        cell,
-        pos,
-        state,
-        patch,
-        planes,
-        squares,
-        count,
-        parent,
-        open_,
-        LOOK_OUT,
-        round(params.border_reach * MM),
-        params.border_drop,
-        params.border_share,
-        params.border_gentle,
-        params.smallest_patch,
-        round(params.largest_building * MM),
-    )
-    spread_roofs(width, height, cell, pos, state, patch, planes, squares, AGREE)
+    patches = find_planes(cells, params)
+    if "roofs" in params.steps:
+        judge_components(cells, patches, link_patches(cells, patches), params)
+        spread_roofs(cells, patches)
 
 
-def _grow(cells: Cells, params: RobustParams) -> npt.NDArray[np.uint8]:
-    """Grow the references over the low points in synchronous passes (step 7); return the new state."""
+def _grow(cells: Cells, references: References, params: RobustParams, room: Room) -> None:
+    """Grow the references over the low points in synchronous passes (step 7); their states and index follow."""
     limit = round(params.search_radius * MM)
-    state, after = cells.state, np.empty_like(cells.state)
-    looked, news, index = np.empty(len(state), np.uint16), np.empty(len(state), np.int32), room_for_index(len(state))
-    for number in range(params.passes):
-        changed = grow(
-            cells.width,
-            cells.cell,
-            cells.pos,
-            state,
-            -(-limit // cells.cell),
-            limit * limit,
-            params.growth_base,
-            params.growth_spread,
-            params.growth_slope,
-            params.growth_step,
-            params.growth_spread,
-            1.5,
-            cells_.ROOF,
-            NO_ROUGHNESS,
-            0.0,
-            0.0,
-            1,
-            number == 0,
-            cells.pos,
-            state,
-            1,
-            looked,
-            news,
-            index,
-            after,
-        )
-        state, after = after, state
+    spread, step = params.growth_spread, params.growth_step
+    rule = Rule(params.growth_base, spread, params.growth_slope, step, spread, 1.5, 0.0, 0.0)
+    left, skip = candidates(cells.state, cells_.ROOF), cells_.ROOF
+    for _ in range(params.passes):
+        changed, left = grow(cells.pos, cells.state, references, 1, limit, rule, skip, NO_ROUGHNESS, 1, left, room)
         if not changed:
             break
-    return state
 
 
 def _label(
-    cloud: Cloud, cells: Cells, state: npt.NDArray[np.uint8], rough: npt.NDArray[np.int32], params: RobustParams
+    cloud: Cloud,
+    cells: Cells,
+    references: References,
+    rough: npt.NDArray[np.int32],
+    params: RobustParams,
+    room: Room,
 ) -> Verdict:
     """Second growth over halved cells where the cloud is sparse (step 10), then the labels (step 11)."""
-    limit = round(params.search_radius * MM)
-    known, pos, width, cell, parts = state, cells.pos, cells.width, cells.cell, 1
+    limit, x0, y0, of_point = round(params.search_radius * MM), cells.x0, cells.y0, cells.of_point
+    x, y, z, state = cloud.x, cloud.y, cloud.z, references.state
+    fixed = NO_POINTS if cloud.fixed is None else cloud.fixed
     if params.refinement == 2 and "refinement" in params.steps:
-        pos, state = halve(
-            cloud.x,
-            cloud.y,
-            cloud.z,
-            cells.x0,
-            cells.y0,
-            cells.of_point,
-            pos,
-            cells.floor,
-            state,
-            width,
-            cells.height,
-            cell,
-        )
-        width, cell, parts, limit = 2 * width, cell // 2, 2, limit // 2
-        state = _grow_fine(cells, known, pos, state, rough, params)
-    ground, unproven = np.empty(cloud.n_core, np.bool_), np.empty(cloud.n_core, np.bool_)
-    label(
-        cloud.x,
-        cloud.y,
-        cloud.z,
-        NO_POINTS if cloud.fixed is None else cloud.fixed,
-        cloud.n_core,
-        cells.x0,
-        cells.y0,
-        cells.of_point,
-        cells.floor,
-        known,
-        rough,
-        parts,
-        width,
-        cell,
-        pos,
-        state,
-        -(-limit // cell),
-        limit * limit,
-        params.tolerance,
-        params.roughness,
-        params.label_spread,
-        params.label_slope,
-        cliff_tops(width, pos, state),
-        room_for_index(len(state)),
-        ground,
-        unproven,
-    )
-    return Verdict(ground, unproven)
+        fine_pos, fine_state = halve(cloud, cells, state)
+        references, limit = _grow_fine(fine_pos, fine_state, references, rough, params, room), limit // 2
+    rule = Tolerance(params.tolerance, params.roughness, params.label_spread, params.label_slope)
+    points = Points(x, y, z, fixed, x0, y0, of_point, cells.floor, state, rough)
+    return label(points, cloud.n_core, references, limit, rule, room)
 
 
 def _grow_fine(
-    coarse: Cells,
-    known: npt.NDArray[np.uint8],
     pos: npt.NDArray[np.int32],
     state: npt.NDArray[np.uint8],
+    coarse: References,
     rough: npt.NDArray[np.int32],
     params: RobustParams,
-) -> npt.NDArray[np.uint8]:
-    """Growth over the finer cells with a tolerance that follows the roughness (step 10)."""
-    limit = round(params.search_radius * MM) // 2
-    width, cell, after = 2 * coarse.width, coarse.cell // 2, np.empty_like(state)
-    looked, news, index = np.empty(len(state), np.uint16), np.empty(len(state), np.int32), room_for_index(len(state))
+    room: Room,
+) -> References:
+    """Growth over the finer cells with a tolerance that follows the roughness (step 10); return their references."""
+    limit, skip = round(params.search_radius * MM) // 2, cells_.ROOF | cells_.HIGH
+    spread, step, factor = params.fine_spread, params.fine_step, params.fine_roughness
+    rule = Rule(params.fine_base, spread, params.fine_slope, step, spread, 2.0, factor, ROUGH_MOST)
+    fine = References(2 * coarse.width, coarse.cell // 2, pos, state, room_for_index(len(state)))
+    left = candidates(state, skip)
     for number in range(params.fine_passes):
-        grow(
-            width,
-            cell,
-            pos,
-            state,
-            -(-limit // (coarse.cell if number == 0 else cell)),
-            limit * limit,
-            params.fine_base,
-            params.fine_spread,
-            params.fine_slope,
-            params.fine_step,
-            params.fine_spread,
-            2.0,
-            cells_.ROOF | cells_.HIGH,
-            rough,
-            params.fine_roughness,
-            ROUGH_MOST,
-            2,
-            number == 0,
-            coarse.pos if number == 0 else pos,
-            known if number == 0 else state,
-            2 if number == 0 else 1,
-            looked,
-            news,
-            index,
-            after,
-        )
-        state, after = after, state
-    return state
+        seek, fold = (coarse, 2) if number == 0 else (fine, 1)
+        _changed, left = grow(pos, state, seek, fold, limit, rule, skip, rough, 2, left, room)
+        if number == 0:
+            index_references(fine.width, fine.cell, pos, state, fine.indexed)
+    if params.fine_passes == 0:
+        index_references(fine.width, fine.cell, pos, state, fine.indexed)
+    return fine

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from ppdf_dask.filters.ppdf.compiled import leaf
+from ppdf_dask.filters.ppdf.compiled import kernel, leaf
 from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
 
 BLOCK = 4
@@ -42,7 +41,7 @@ def cliff_tops(width: int, pos: npt.NDArray[np.int32], state: npt.NDArray[np.uin
     return tops
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _find_tops(width: Any, pos: Any, state: Any, spans: Any, tops: Any) -> None:
     wide = width // BLOCK
     for k in range(len(state)):
@@ -64,12 +63,12 @@ def _find_tops(width: Any, pos: Any, state: Any, spans: Any, tops: Any) -> None:
 
 
 @leaf
-def at_cliff(pos: Any, z: Any, found: Any, slope: Any) -> Any:
-    """Tell whether the references found make a cliff, and `z` lies no higher than one of them."""
+def at_cliff(pos: Any, z: Any, found: Any, at: Any, slope: Any) -> Any:
+    """Tell whether the references `found` from `at` on make a cliff, and `z` lies no higher than one of them."""
     if slope <= STEEP:
         return False
     bottom, top = np.int64(NOWHERE), np.int64(NO_CLIFF)
-    for q in range(4):
+    for q in range(at, at + 4):
         if found[q] >= 0:
             height = np.int64(pos[found[q], 2])
             bottom, top = min(bottom, height), max(top, height)

@@ -5,40 +5,48 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+import numpy.typing as npt
 
-from ppdf_dask.filters.ppdf.robust.cells import DROPPED, HIGH, LOW, MAYBE_DROPPED, ROOF
+from ppdf_dask.filters.cloud import Cloud
+from ppdf_dask.filters.ppdf.compiled import kernel
+from ppdf_dask.filters.ppdf.robust.cells import DROPPED, HIGH, LOW, MAYBE_DROPPED, ROOF, Cells
 
 
-@njit(nogil=True, cache=True)
 def halve(
+    cloud: Cloud, cells: Cells, state: npt.NDArray[np.uint8]
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.uint8]]:
+    """Cut each cell in four and take their lowest points; return their positions and states.
+
+    The low point of the cell keeps its state; the others start as candidates, and as roof where the cell's is.
+    """
+    fine_pos, fine = np.empty((4 * len(state), 3), np.int32), np.zeros(4 * len(state), np.uint8)
+    x, y, z, corner = cloud.x, cloud.y, cloud.z, (cells.x0, cells.y0)
+    _halve(x, y, z, corner, cells.of_point, cells.pos, cells.floor, state, cells.width, cells.cell // 2, fine_pos, fine)
+    return fine_pos, fine
+
+
+@kernel
+def _halve(
     x: Any,
     y: Any,
     z: Any,
-    x0: Any,
-    y0: Any,
+    corner: Any,
     of_point: Any,
     pos: Any,
     floor: Any,
     state: Any,
     width: Any,
-    height: Any,
-    cell: Any,
-) -> Any:
-    """Cut each cell in four and take their lowest points; return their positions and states.
-
-    The low point of the cell keeps its state; the others start as candidates, and as roof where the cell's is.
-    """
-    half = cell // 2
+    half: Any,
+    fine_pos: Any,
+    fine: Any,
+) -> None:
     wide = 2 * width
-    fine_pos = np.empty((wide * 2 * height, 3), np.int32)
-    fine = np.zeros(wide * 2 * height, np.uint8)
     for i in range(len(x)):
         k = of_point[i]
         if not state[k] & LOW or z[i] <= floor[k]:
             continue
-        xi = x[i] - x0
-        yi = y[i] - y0
+        xi = x[i] - corner[0]
+        yi = y[i] - corner[1]
         f = yi // half * wide + xi // half
         if fine[f]:
             if z[i] > fine_pos[f, 2]:
@@ -58,4 +66,3 @@ def halve(
         elif state[k]:
             f = k // width * 2 * wide + k % width * 2
             fine[f] = fine[f + 1] = fine[f + wide] = fine[f + wide + 1] = state[k]
-    return fine_pos, fine

@@ -2,100 +2,182 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+import numpy.typing as npt
 
+from ppdf_dask.filters.cloud import Verdict
+from ppdf_dask.filters.ppdf.compiled import kernel
 from ppdf_dask.filters.ppdf.robust.cells import HIGH, LOW, REF, UNPROVEN
-from ppdf_dask.filters.ppdf.robust.cliffs import BLOCK, at_cliff
-from ppdf_dask.filters.ppdf.robust.growth import NOT_KNOWN
-from ppdf_dask.filters.ppdf.robust.surface import count_within, height_above, index_references, nearest, reach
+from ppdf_dask.filters.ppdf.robust.cliffs import BLOCK, at_cliff, cliff_tops
+from ppdf_dask.filters.ppdf.robust.growth import NOT_KNOWN, References
+from ppdf_dask.filters.ppdf.robust.lanes import (
+    ASKED,
+    BATCH,
+    CELL,
+    COUNT,
+    DISTANCE,
+    FX,
+    FY,
+    HEIGHT,
+    RINGS,
+    SLOPE,
+    Room,
+    X,
+    Y,
+    Z,
+    surfaces,
+)
+from ppdf_dask.filters.ppdf.robust.surface import all_proven, count_within
 
 FAR_ABOVE = 5_000
 """Millimetres above its cell's low point from where a point is sought nowhere but at cliffs."""
 
 
-@njit(nogil=True, cache=True)
-def label(
-    x: Any,
-    y: Any,
-    z: Any,
-    fixed: Any,
+class Tolerance(NamedTuple):
+    """Up to where a point is ground, in metres above the references: see `RobustParams`.
+
+    Attributes
+    ----------
+    tolerance, roughness, spread, slope : float
+        `tolerance`, `roughness`, `label_spread` and `label_slope`.
+    """
+
+    tolerance: float
+    roughness: float
+    spread: float
+    slope: float
+
+
+class Points(NamedTuple):
+    """The points to label, and the coarse cells they lie in.
+
+    Attributes
+    ----------
+    x, y, z : numpy.ndarray
+        int32, mm; the core first.
+    fixed : numpy.ndarray
+        Ground from the start, bool; empty: none.
+    x0, y0 : int
+        Corner of the grid.
+    of_point, floor, known, rough : numpy.ndarray
+        The cell of each point; the height below which nothing counts, the state and the roughness of each cell.
+    """
+
+    x: npt.NDArray[np.int32]
+    y: npt.NDArray[np.int32]
+    z: npt.NDArray[np.int32]
+    fixed: npt.NDArray[np.bool_]
+    x0: int
+    y0: int
+    of_point: npt.NDArray[np.int32]
+    floor: npt.NDArray[np.int32]
+    known: npt.NDArray[np.uint8]
+    rough: npt.NDArray[np.int32]
+
+
+def label(points: Points, n_core: int, references: References, limit: int, rule: Tolerance, room: Room) -> Verdict:
+    """Tell which of the first `n_core` points are ground, by the references within `limit` mm."""
+    width, cell, pos, state, index = references
+    ground, unproven = np.empty(n_core, np.bool_), np.empty(n_core, np.bool_)
+    known, tops = all_proven(index), cliff_tops(width, pos, state)
+    rings, soft = 0 if known else -(-limit // cell), 0.1 * (cell * 1e-3) ** 2
+    start = 0
+    while start < n_core:
+        start, count = _gather(points, n_core, width, cell, pos, state, tops, start, ground, unproven, room.place)
+        surfaces(room, count, index, pos, width, cell, rings, limit * limit, soft)
+        place, answer = room.place[:count], room.answer
+        _decide(
+            points.of_point,
+            points.rough,
+            width,
+            pos,
+            index[2],
+            known,
+            rule,
+            ground,
+            unproven,
+            place,
+            answer,
+            room.found,
+        )
+    return Verdict(ground, unproven)
+
+
+@kernel
+def _gather(
+    points: Any,
     n_core: Any,
-    x0: Any,
-    y0: Any,
-    of_point: Any,
-    floor: Any,
-    known: Any,
-    rough: Any,
-    parts: Any,
     width: Any,
     cell: Any,
     pos: Any,
     state: Any,
-    rings: Any,
-    limit2: Any,
-    tolerance: Any,
-    rough_factor: Any,
-    spread: Any,
-    slope_factor: Any,
     tops: Any,
-    index: Any,
+    start: Any,
     ground: Any,
     unproven: Any,
-) -> None:
-    """Set `ground` and `unproven` of the core points.
-
-    `of_point`, `floor`, `known` (their states) and `rough` speak of the coarse cells; `width`, `cell`, `pos` and
-    `state` of the fine ones, `parts` x `parts` to a coarse one; `tops` is of `cliff_tops`, `index` room for
-    `index_references`.
-    """
-    right, left, open_ = index
-    index_references(width, state, right, left, open_)
-    all_known = open_[len(open_) - 1] == 0
-    found = np.empty(8, np.int64)
-    soft = 0.1 * (cell * 1e-3) ** 2
-    for i in range(n_core):
-        ground[i] = False
-        unproven[i] = False
-        if len(fixed) > 0 and fixed[i]:
-            ground[i] = True
-            continue
+    place: Any,
+) -> Any:
+    """Label the next points that need no surface, and put the others; return the point to go on with and how many."""
+    x, y, z, fixed, x0, y0, of_point, floor, known, _rough = points
+    i, count = start, np.int64(0)
+    while i < n_core and count < BATCH:
         big = of_point[i]
-        if not known[big] & LOW:
-            unproven[i] = (known[big] & UNPROVEN) != 0
-            continue
-        if z[i] <= floor[big]:
-            continue
-        xi, yi, zi = np.int64(x[i]) - x0, np.int64(y[i]) - y0, np.int64(z[i])
-        k = big
-        if parts > 1:
-            k = yi // cell * width + xi // cell
-        is_low = zi == pos[k, 2] and xi == pos[k, 0] and yi == pos[k, 1]
-        unknown = is_low and (state[k] & UNPROVEN) != 0
-        only_cliff = is_low or zi - pos[k, 2] >= FAR_ABOVE or (state[k] & HIGH) != 0
-        if only_cliff:
-            b = k // width // BLOCK * (width // BLOCK) + k % width // BLOCK
+        pin = len(fixed) > 0 and fixed[i]
+        ground[i] = pin
+        unproven[i] = not pin and not known[big] & LOW and (known[big] & UNPROVEN) != 0
+        if not pin and known[big] & LOW and z[i] > floor[big]:
+            xi, yi, zi = np.int64(x[i]) - x0, np.int64(y[i]) - y0, np.int64(z[i])
+            row, col = yi // cell, xi // cell
+            k = row * width + col
+            is_low = zi == pos[k, 2] and xi == pos[k, 0] and yi == pos[k, 1]
             ground[i] = is_low and (state[k] & REF) != 0
-            if ground[i] or zi > tops[b, 0]:
-                unproven[i] = unknown
-                continue
-            unknown |= tops[b, 1] != 0
-        fx, fy = xi % cell, yi % cell
-        nearest(right, left, pos, width, cell, k, xi, yi, fx, fy, limit2, found)
-        if not all_known:
-            ring = reach(found, fx, fy, cell, rings)
-            unknown |= count_within(open_, width, k, ring) > 0
-        n, r, slope, d, _step = height_above(pos, xi, yi, zi, found, soft)
-        if n > 0 and r > -(3.0 + slope * d):
-            if at_cliff(pos, zi, found, slope):
+            unproven[i] = is_low and (state[k] & UNPROVEN) != 0
+            only_cliff = is_low or zi - pos[k, 2] >= FAR_ABOVE or (state[k] & HIGH) != 0
+            settled = False
+            if only_cliff:
+                b = row // BLOCK * (width // BLOCK) + col // BLOCK
+                settled = ground[i] or zi > tops[b, 0]
+                unproven[i] |= not settled and tops[b, 1] != 0
+            if not settled:
+                place[count, X], place[count, Y], place[count, Z] = xi, yi, zi
+                place[count, FX], place[count, FY] = xi - col * cell, yi - row * cell
+                place[count, CELL], place[count, ASKED] = k, 2 * i + only_cliff
+                count += 1
+        i += 1
+    return i, count
+
+
+@kernel
+def _decide(
+    of_point: Any,
+    rough: Any,
+    width: Any,
+    pos: Any,
+    unproven_cells: Any,
+    all_known: Any,
+    rule: Any,
+    ground: Any,
+    unproven: Any,
+    place: Any,
+    answer: Any,
+    found: Any,
+) -> None:
+    """Label the points put; `all_known` where no cell is unproven."""
+    for m in range(len(place)):
+        i, only_cliff = place[m, ASKED] >> 1, place[m, ASKED] & 1
+        big = of_point[i]
+        r, slope, d = answer[m, HEIGHT], answer[m, SLOPE], answer[m, DISTANCE]
+        unknown = not all_known and count_within(unproven_cells, width, place[m, CELL], place[m, RINGS]) > 0
+        if place[m, COUNT] > 0 and r > -(3.0 + slope * d):
+            rise = (rule.spread + rule.slope * slope) * d
+            if at_cliff(pos, place[m, Z], found, 8 * m, slope):
                 ground[i] = True
+            elif not only_cliff and rough[big] == NOT_KNOWN:
+                ground[i] = r < rule.tolerance + rise
+                unknown |= ground[i] != (r < 4.0 * rule.tolerance + rise)
             elif not only_cliff:
-                rise = (spread + slope_factor * slope) * d
-                if rough[big] == NOT_KNOWN:
-                    ground[i] = r < tolerance + rise
-                    unknown |= ground[i] != (r < 4.0 * tolerance + rise)
-                else:
-                    ground[i] = r < min(4.0 * tolerance, tolerance + rough_factor * rough[big] * 1e-3) + rise
-        unproven[i] = unknown
+                most = min(4.0 * rule.tolerance, rule.tolerance + rule.roughness * rough[big] * 1e-3)
+                ground[i] = r < most + rise
+        unproven[i] |= unknown

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+import numpy.typing as npt
 
-from ppdf_dask.filters.ppdf.compiled import leaf
-from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, ROOF, UNPROVEN
-from ppdf_dask.filters.ppdf.robust.planes import NOT_KNOWN_PATCH
+from ppdf_dask.filters.ppdf.compiled import kernel, leaf
+from ppdf_dask.filters.ppdf.robust.cells import DROPPED, FIXED, LOW, MAYBE_DROPPED, REF, ROOF, UNPROVEN, Cells
+from ppdf_dask.filters.ppdf.robust.params import RobustParams
+from ppdf_dask.filters.ppdf.robust.planes import NOT_KNOWN_PATCH, Patches
+from ppdf_dask.grid import MM
+
+LOOK_OUT = 12
+"""Cells: how far a seed looks for its own patch before it counts as border."""
+
+NEAR = 3
+"""Cells: low points of two patches so near vote on whether the patches are one surface."""
+
+AGREE = 1.0
+"""Metres: two low points agree when each lies this near to the other's plane."""
 
 STEP = 0.5
 """Metres below a patch's plane at which a low point lies partway down."""
@@ -38,8 +49,32 @@ def _root(parent: Any, p: Any) -> Any:
     return p
 
 
-@njit(nogil=True, cache=True)
-def link_patches(
+class Components(NamedTuple):
+    """Patches that are one surface.
+
+    Attributes
+    ----------
+    root : numpy.ndarray
+        For each patch the first of its component, int32.
+    open : numpy.ndarray
+        The patches that touch something unproven, bool.
+    """
+
+    root: npt.NDArray[np.int32]
+    open: npt.NDArray[np.bool_]
+
+
+def link_patches(cells: Cells, patches: Patches) -> Components:
+    """Unite the patches whose planes agree where they touch."""
+    count = len(patches.planes)
+    root, open_ = np.arange(count, dtype=np.int32), np.zeros(count, np.bool_)
+    votes, touched = np.zeros((count, 2), np.int64), np.empty(count, np.int64)
+    _link_patches(cells.width, cells.cell, cells.pos, cells.state, *patches, NEAR, AGREE, votes, touched, root, open_)
+    return Components(root, open_)
+
+
+@kernel
+def _link_patches(
     width: Any,
     cell: Any,
     pos: Any,
@@ -47,19 +82,18 @@ def link_patches(
     patch: Any,
     planes: Any,
     squares: Any,
-    count: Any,
     near: Any,
     agree: Any,
+    votes: Any,
+    touched: Any,
     parent: Any,
     open_: Any,
 ) -> None:
-    """Unite patches whose planes agree; mark in `open_` the patches that touch something unproven."""
-    votes, agreeing = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    touched = np.empty(count, np.int64)
-    for p in range(count):
-        parent[p] = p
-        open_[p] = False
-    for p in range(count):
+    """Unite patches whose planes agree; mark in `open_` the patches that touch something unproven.
+
+    `votes` (n, 2) is zero and `touched` room of one row for each patch; `parent` of each patch is itself.
+    """
+    for p in range(len(parent)):
         n = 0
         c0, r0, size = squares[p, 0], squares[p, 1], squares[p, 2]
         for r in range(r0, r0 + size):
@@ -73,28 +107,69 @@ def link_patches(
                         q = np.int64(patch[j])
                         if q <= p:
                             continue
-                        if votes[q] == 0:
+                        if votes[q, 0] == 0:
                             touched[n] = q
                             n += 1
-                        votes[q] += 1
+                        votes[q, 0] += 1
                         if (
                             abs(residual(planes, squares, p, pos, j, cell)) < agree
                             and abs(residual(planes, squares, q, pos, k, cell)) < agree
                         ):
-                            agreeing[q] += 1
+                            votes[q, 1] += 1
         for m in range(n):
             q = touched[m]
-            if 2 * agreeing[q] >= votes[q]:
+            if 2 * votes[q, 1] >= votes[q, 0]:
                 a, b = _root(parent, p), _root(parent, q)
                 parent[max(a, b)] = min(a, b)
-            votes[q] = 0
-            agreeing[q] = 0
-    for p in range(count):
+            votes[q, 0] = votes[q, 1] = 0
+    for p in range(len(parent)):
         parent[p] = _root(parent, p)
 
 
-@njit(nogil=True, cache=True)
-def judge_components(
+def judge_components(cells: Cells, patches: Patches, components: Components, params: RobustParams) -> None:
+    """Drop the seeds of components that are too small or whose border drops away on most sides.
+
+    A wall falls at once; the flank of an embankment falls step by step. A direction counts as `border_gentle` of one
+    when it falls no more steeply than earth lies (`HEAPED`), or when a low point lies partway down, more than `STEP`
+    below the plane, before the drop, and nowhere falls like a `WALL`.
+    """
+    root, open_ = components
+    tally, box = np.zeros((len(root), 4), np.int64), np.empty((len(root), 4), np.int64)
+    box[:] = 1 << 40, 1 << 40, -1, -1
+    reach = round(params.border_reach * MM)
+    _walk_borders(
+        cells.width,
+        cells.cell,
+        cells.pos,
+        cells.state,
+        *patches,
+        root,
+        open_,
+        LOOK_OUT,
+        reach,
+        params.border_drop,
+        tally,
+        box,
+    )
+    seeds, borders, drops, slow = tally.T
+    side = (np.maximum(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1]) + 1) * cells.cell
+    small, building = seeds < params.smallest_patch, side < round(params.largest_building * MM)
+    raised = drops + params.border_gentle * slow > params.border_share * borders
+    verdict = np.select(
+        [open_ & (building | small), open_, small, raised & building],
+        [UNPROVEN | MAYBE_DROPPED, np.uint8(0), DROPPED, ROOF],
+        np.uint8(0),
+    )
+    k = np.flatnonzero((patches.of_cell >= 0) & (cells.state & FIXED == 0))
+    judged, state = verdict[root[patches.of_cell[k]]], cells.state[k]
+    cells.state[k] = np.where(judged & (DROPPED | ROOF), state & ~REF, state) | judged
+
+
+SEEDS, BORDERS, DROPS, SLOW = range(4)
+
+
+@kernel
+def _walk_borders(
     width: Any,
     cell: Any,
     pos: Any,
@@ -102,38 +177,22 @@ def judge_components(
     patch: Any,
     planes: Any,
     squares: Any,
-    count: Any,
     parent: Any,
     open_: Any,
     look_out: Any,
     reach: Any,
     drop: Any,
-    share: Any,
-    gentle: Any,
-    smallest: Any,
-    largest: Any,
+    tally: Any,
+    box: Any,
 ) -> None:
-    """Drop the seeds of components that are too small or whose border drops away on most sides.
-
-    A wall falls at once; the flank of an embankment falls step by step. A direction counts as `gentle` of one when it
-    falls no more steeply than earth lies (`HEAPED`), or when a low point lies partway down, more than `STEP` below the
-    plane, before the drop, and nowhere falls like a `WALL`.
-    """
-    seeds = np.zeros(count, np.int64)
-    borders = np.zeros(count, np.int64)
-    drops = np.zeros(count, np.int64)
-    slow = np.zeros(count, np.int64)
-    box = np.empty((count, 4), np.int64)
-    for root in range(count):
-        box[root, 0] = box[root, 1] = 1 << 40
-        box[root, 2] = box[root, 3] = -1
+    """Count for each component its `SEEDS`, its `BORDERS` in four directions and those that fall; bound it by `box`."""
     shift = (1, -1, width, -width)
     for k in range(len(state)):
         p = np.int64(patch[k])
         if p < 0:
             continue
         root = parent[p]
-        seeds[root] += 1
+        tally[root, SEEDS] += 1
         if open_[p]:
             open_[root] = True
         row, col = k // width, k % width
@@ -167,35 +226,31 @@ def judge_components(
                     level = height
             if not inside:
                 slowly = steepest < HEAPED or (steps and steepest < WALL)
-                borders[root] += 1
-                drops[root] += falls and not slowly
-                slow[root] += falls and slowly
-    verdict = np.zeros(count, np.uint8)
-    for root in range(count):
-        if parent[root] != root:
-            continue
-        side = (max(box[root, 2] - box[root, 0], box[root, 3] - box[root, 1]) + 1) * cell
-        if open_[root]:
-            if side < largest or seeds[root] < smallest:
-                verdict[root] = UNPROVEN | MAYBE_DROPPED
-        elif seeds[root] < smallest:
-            verdict[root] = DROPPED
-        elif drops[root] + gentle * slow[root] > share * borders[root] and side < largest:
-            verdict[root] = ROOF
-    for k in range(len(state)):
-        if patch[k] >= 0 and not state[k] & FIXED:
-            v = verdict[parent[patch[k]]]
-            if v & (DROPPED | ROOF):
-                state[k] &= ~REF
-            state[k] |= v
+                tally[root, BORDERS] += 1
+                tally[root, DROPS] += falls and not slowly
+                tally[root, SLOW] += falls and slowly
 
 
-@njit(nogil=True, cache=True)
-def spread_roofs(
-    width: Any, height: Any, cell: Any, pos: Any, state: Any, patch: Any, planes: Any, squares: Any, agree: Any
-) -> None:
+def spread_roofs(cells: Cells, patches: Patches) -> None:
     """Make roof of the low points beside a roof's seeds and near their plane: chimneys, edges, what no plane took."""
-    mark = np.zeros(len(state), np.uint8)
+    mark = np.zeros(len(cells.state), np.uint8)
+    _spread_roofs(cells.width, cells.height, cells.cell, cells.pos, cells.state, *patches, AGREE, mark)
+    np.bitwise_or(cells.state, mark, out=cells.state)
+
+
+@kernel
+def _spread_roofs(
+    width: Any,
+    height: Any,
+    cell: Any,
+    pos: Any,
+    state: Any,
+    patch: Any,
+    planes: Any,
+    squares: Any,
+    agree: Any,
+    mark: Any,
+) -> None:
     for row in range(1, height - 1):
         for k in range(row * width + 1, row * width + width - 1):
             if not state[k] & LOW or state[k] & (REF | ROOF):
@@ -206,5 +261,3 @@ def spread_roofs(
                         mark[k] |= MAYBE_DROPPED
                     if state[j] & ROOF and abs(residual(planes, squares, np.int64(patch[j]), pos, k, cell)) < agree:
                         mark[k] |= ROOF
-    for k in range(len(state)):
-        state[k] |= mark[k]

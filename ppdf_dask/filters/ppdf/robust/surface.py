@@ -2,31 +2,62 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from ppdf_dask.filters.ppdf.compiled import leaf
+from ppdf_dask.filters.ppdf.compiled import kernel, leaf
 from ppdf_dask.filters.ppdf.robust.cells import REF, UNPROVEN
 
 NONE = 60_000
 """Cells: no reference in this direction; farther than any search."""
 
 
-def room_for_index(cells: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16], npt.NDArray[np.int32]]:
-    """Return the arrays that `index_references` fills: 8 bytes per cell."""
-    return np.empty(cells, np.uint16), np.empty(cells, np.uint16), np.empty(cells, np.int32)
+Index: TypeAlias = tuple[
+    npt.NDArray[np.uint16],
+    npt.NDArray[np.uint16],
+    npt.NDArray[np.int32],
+    npt.NDArray[np.uint32],
+]
+"""Steps to the next reference of the row rightwards and leftwards, summed-area table of the unproven cells, and the
+places of the references within their cells."""
 
 
-@njit(nogil=True, cache=True)
-def index_references(width: Any, state: Any, right: Any, left: Any, unproven: Any) -> None:
-    """Index a grid for `nearest` and `count_within`.
+NOWHERE = np.uint32(2**32 - 1)
+"""Place of no reference; cells are narrower than 65 m."""
 
-    `right` and `left` (uint16) get the number of cells to the next reference of the row, the cell itself included,
-    or `NONE`; `unproven` (int32) the summed-area table of unproven cells.
+
+def room_for_index(cells: int) -> Index:
+    """Return the arrays that `index_references` fills: 12 bytes per cell."""
+    return (
+        np.empty(cells, np.uint16),
+        np.empty(cells, np.uint16),
+        np.empty(cells, np.int32),
+        np.empty(cells, np.uint32),
+    )
+
+
+def all_proven(index: Index) -> bool:
+    """Tell whether no cell is unproven."""
+    return bool(index[2][-1] == 0)
+
+
+@leaf
+def _packed(x: Any, y: Any) -> Any:
+    return np.uint32(y << 16 | x)
+
+
+@kernel
+def index_references(width: Any, cell: Any, pos: Any, state: Any, index: Any) -> None:
+    """Index a grid for `nearest`, `count_within` and `lanes.surfaces`.
+
+    `index` gets the number of cells to the next reference of the row, the cell itself included, or `NONE`, rightwards
+    and leftwards (uint16); the summed-area table of unproven cells (int32); the places of the references (uint32), mm
+    from the corner of the cell, x in the lower half and y in the upper, or `NOWHERE`: with them a search touches a
+    third of the memory.
     """
+    right, left, unproven, place = index
     for row in range(len(state) // width):
         start = row * width
         gap = NONE
@@ -36,10 +67,28 @@ def index_references(width: Any, state: Any, right: Any, left: Any, unproven: An
         gap = NONE
         total = 0
         for k in range(start, start + width):
-            gap = 0 if state[k] & REF else min(gap + 1, NONE)
+            is_reference = (state[k] & REF) != 0
+            gap = 0 if is_reference else min(gap + 1, NONE)
             left[k] = gap
             total += (state[k] & UNPROVEN) != 0
             unproven[k] = total + (unproven[k - width] if row > 0 else 0)
+            place[k] = _packed(pos[k, 0] - (k - start) * cell, pos[k, 1] - row * cell) if is_reference else NOWHERE
+
+
+@leaf
+def add_reference(width: Any, cell: Any, pos: Any, k: Any, index: Any) -> None:
+    """Add the reference of cell `k` to the index."""
+    right, left, _unproven, place = index
+    place[k] = _packed(pos[k, 0] % cell, pos[k, 1] % cell)
+    start = k - k % width
+    j = k
+    while j >= start and right[j] > k - j:
+        right[j] = k - j
+        j -= 1
+    j = k
+    while j < start + width and left[j] > j - k:
+        left[j] = j - k
+        j += 1
 
 
 @leaf
@@ -52,37 +101,40 @@ def count_within(table: Any, width: Any, k: Any, ring: Any) -> Any:
 
 
 @leaf
-def _nearest_in(
+def nearest(
     gap: Any,
+    place: Any,
     pos: Any,
     width: Any,
     cell: Any,
     k: Any,
-    x: Any,
-    y: Any,
     fx: Any,
     fy: Any,
     along: Any,
     up: Any,
     found: Any,
-    q: Any,
+    at: Any,
+    done: Any,
 ) -> None:
-    """Look in one quadrant for a nearer reference than `found` has.
+    """Look in one quadrant for a nearer reference than `found[at]`, which knows those up to `done` cells away.
 
-    `along` and `up` are 1 or -1, `gap` is the index that way. Row by row outwards, from reference to reference, as
-    long as a row or a column can still hold a nearer one.
+    `found[at]` is a cell or -1, `found[at + 4]` its squared distance or the largest. The place lies `fx`, `fy` within
+    cell `k`; a reference at that very place is none. The quadrants are half-open, so that a point on an axis belongs
+    to one of them, and numbered right + 2 up: `along` and `up` are 1 or -1, `gap` is the index that way. Row by row
+    outwards, from reference to reference, as long as a row or a column can still hold a nearer one.
     """
     wide = cell - fx if along > 0 else fx + 1
     high = cell - fy if up > 0 else fy + 1
-    best, which = found[4 + q], found[q]
+    best, which = found[at + 4], found[at]
     row, far2 = k, np.int64(0)
     for r in range(NONE):
-        o = np.int64(gap[row])
+        o = np.int64(gap[row]) if r > done else done + 1 + np.int64(gap[row + (done + 1) * along])
         u2 = np.int64(0) if o == 0 else (wide + (o - 1) * cell) ** 2
         while u2 + far2 <= best:
             j = row + o * along
-            u = (np.int64(pos[j, 0]) - x) * along
-            v = (np.int64(pos[j, 1]) - y) * up
+            there = np.int64(place[j])
+            u = o * cell + ((there & 65_535) - fx) * along
+            v = r * cell + ((there >> 16) - fy) * up
             d2 = u * u + v * v
             inside = (u >= 0) & (v >= 0) & ((u if along == up else v) > 0)
             if inside and (d2 < best or (d2 == best and (which < 0 or before(pos, j, which)))):
@@ -94,65 +146,18 @@ def _nearest_in(
         far2 = (high + r * cell) ** 2
         if far2 > best:
             break
-    found[q] = which
-    found[4 + q] = best
+    found[at] = which
+    found[at + 4] = best
 
 
 @leaf
-def nearest(
-    right: Any,
-    left: Any,
-    pos: Any,
-    width: Any,
-    cell: Any,
-    k: Any,
-    x: Any,
-    y: Any,
-    fx: Any,
-    fy: Any,
-    limit2: Any,
-    found: Any,
-) -> None:
-    """Find the nearest reference in each quadrant around (`x`, `y`), none at that very place.
-
-    The place lies `fx`, `fy` within cell `k`. `found` (int64, 8) gets the four cells or -1, and the four squared
-    distances or `limit2`. The quadrants are half-open, so that a point on an axis belongs to one of them, and numbered
-    right + 2 up. First the cells around, where it mostly is; then quadrant by quadrant what they leave open.
-    """
-    for q in range(4):
-        found[q] = -1
-        found[4 + q] = limit2
-    for dr in range(-1, 2):
-        for j in range(k + dr * width - 1, k + dr * width + 2):
-            if right[j] != 0:
-                continue
-            dx = np.int64(pos[j, 0]) - x
-            dy = np.int64(pos[j, 1]) - y
-            d2 = dx * dx + dy * dy
-            is_right = (dx > 0) | ((dx == 0) & (dy < 0))
-            is_up = (dy > 0) | ((dy == 0) & (dx > 0))
-            quadrant = np.int64(is_right) + 2 * np.int64(is_up)
-            if d2 > found[4 + quadrant] or d2 == 0:
-                continue
-            if d2 < found[4 + quadrant] or found[quadrant] < 0 or before(pos, j, found[quadrant]):
-                found[4 + quadrant] = d2
-                found[quadrant] = j
-    for q in range(4):
-        to_side = 2 * cell - fx if q & 1 else cell + fx
-        to_end = 2 * cell - fy if q & 2 else cell + fy
-        if found[4 + q] >= min(to_side, to_end) ** 2:
-            way, along = (right, 1) if q & 1 else (left, -1)
-            _nearest_in(way, pos, width, cell, k, x, y, fx, fy, along, 1 if q & 2 else -1, found, q)
-
-
-@leaf
-def reach(found: Any, fx: Any, fy: Any, cell: Any, rings: Any) -> Any:
+def reach(found: Any, at: Any, fx: Any, fy: Any, cell: Any, rings: Any) -> Any:
     """Return how many rings of cells decide what `nearest` found: beyond them nothing could be nearer.
 
     `fx`, `fy` is the place within its cell; `rings` where a quadrant is empty.
     """
     for q in range(4):
-        if found[q] < 0:
+        if found[at + q] < 0:
             return rings
     for ring in range(rings):
         right = (ring + 1) * cell - fx
@@ -160,10 +165,10 @@ def reach(found: Any, fx: Any, fy: Any, cell: Any, rings: Any) -> Any:
         top = (ring + 1) * cell - fy
         bottom = ring * cell + fy
         if (
-            found[7] < min(right, top) ** 2
-            and found[6] < min(left, top) ** 2
-            and found[4] < min(left, bottom) ** 2
-            and found[5] < min(right, bottom) ** 2
+            found[at + 7] < min(right, top) ** 2
+            and found[at + 6] < min(left, top) ** 2
+            and found[at + 4] < min(left, bottom) ** 2
+            and found[at + 5] < min(right, bottom) ** 2
         ):
             return ring
     return rings
@@ -177,70 +182,3 @@ def before(pos: Any, j: Any, k: Any) -> Any:
     if pos[j, 0] != pos[k, 0]:
         return pos[j, 0] < pos[k, 0]
     return pos[j, 1] < pos[k, 1]
-
-
-@leaf
-def height_above(pos: Any, x: Any, y: Any, z: Any, found: Any, soft: Any) -> Any:
-    """Return (count, height above the surface, slope, distance and height above the nearest reference), metres."""
-    n = 0
-    near = np.int64(-1)
-    near2 = np.int64(1) << 60
-    for q in range(4):
-        j = found[q]
-        if j < 0:
-            continue
-        n += 1
-        dx = np.int64(pos[j, 0]) - x
-        dy = np.int64(pos[j, 1]) - y
-        d2 = dx * dx + dy * dy
-        if d2 < near2 or (d2 == near2 and before(pos, j, near)):
-            near2 = d2
-            near = j
-    if n == 0:
-        return 0, 0.0, 0.0, 0.0, 0.0
-    d = np.sqrt(near2 * 1e-6)
-    step = (z - np.int64(pos[near, 2])) * 1e-3
-    ws = 0.0
-    xm = ym = zm = 0.0
-    weak = 1e-4 if n < 3 else soft
-    for q in range(4):
-        j = found[q]
-        if j >= 0:
-            dx = (pos[j, 0] - np.int64(x)) * 1e-3
-            dy = (pos[j, 1] - np.int64(y)) * 1e-3
-            w = 1.0 / (dx * dx + dy * dy + weak)
-            ws += w
-            xm += w * dx
-            ym += w * dy
-            zm += w * ((pos[j, 2] - np.int64(z)) * 1e-3)
-    xm /= ws
-    ym /= ws
-    zm /= ws
-    if n < 3:
-        return n, -zm, 0.0, d, step
-    scale = n / ws
-    sxx = syy = soft
-    sxy = sxz = syz = 0.0
-    for q in range(4):
-        j = found[q]
-        if j >= 0:
-            dx = (pos[j, 0] - np.int64(x)) * 1e-3
-            dy = (pos[j, 1] - np.int64(y)) * 1e-3
-            w = scale / (dx * dx + dy * dy + weak)
-            dz = (pos[j, 2] - np.int64(z)) * 1e-3 - zm
-            dx -= xm
-            dy -= ym
-            sxx += w * dx * dx
-            sxy += w * dx * dy
-            syy += w * dy * dy
-            sxz += w * dx * dz
-            syz += w * dy * dz
-    det = sxx * syy - sxy * sxy
-    a = (sxz * syy - syz * sxy) / det
-    b = (syz * sxx - sxz * sxy) / det
-    slope = np.sqrt(a * a + b * b)
-    if slope > 3.0:
-        a *= 3.0 / slope
-        b *= 3.0 / slope
-        slope = 3.0
-    return n, a * xm + b * ym - zm, slope, d, step
