@@ -22,6 +22,9 @@ NEAR = 3
 AGREE = 1.0
 """Metres: two low points agree when each lies this near to the other's plane."""
 
+UNKNOWN = np.int32(2**31 - 1)
+"""Patch of a cell that is not proven: after all others, so that one comparison finds what has to be looked at."""
+
 STEP = 0.5
 """Metres below a patch's plane at which a low point lies partway down."""
 
@@ -69,7 +72,22 @@ def link_patches(cells: Cells, patches: Patches) -> Components:
     count = len(patches.planes)
     root, open_ = np.arange(count, dtype=np.int32), np.zeros(count, np.bool_)
     votes, touched = np.zeros((count, 2), np.int64), np.empty(count, np.int64)
-    _link_patches(cells.width, cells.cell, cells.pos, cells.state, *patches, NEAR, AGREE, votes, touched, root, open_)
+    unknown = (cells.state & UNPROVEN != 0) | (patches.of_cell == NOT_KNOWN_PATCH)
+    seen = np.where(unknown, UNKNOWN, patches.of_cell)
+    _link_patches(
+        cells.width,
+        cells.cell,
+        cells.pos,
+        seen,
+        patches.planes,
+        patches.squares,
+        NEAR,
+        AGREE,
+        votes,
+        touched,
+        root,
+        open_,
+    )
     return Components(root, open_)
 
 
@@ -78,7 +96,6 @@ def _link_patches(
     width: Any,
     cell: Any,
     pos: Any,
-    state: Any,
     patch: Any,
     planes: Any,
     squares: Any,
@@ -91,7 +108,8 @@ def _link_patches(
 ) -> None:
     """Unite patches whose planes agree; mark in `open_` the patches that touch something unproven.
 
-    `votes` (n, 2) is zero and `touched` room of one row for each patch; `parent` of each patch is itself.
+    `patch` is `UNKNOWN` where a cell is unproven. `votes` (n, 2) is zero and `touched` room of one row for each patch;
+    `parent` of each patch is itself.
     """
     for p in range(len(parent)):
         n = 0
@@ -102,11 +120,12 @@ def _link_patches(
                     continue
                 for dr in range(-near, near + 1):
                     for j in range(k + dr * width - near, k + dr * width + near + 1):
-                        if state[j] & UNPROVEN or patch[j] == NOT_KNOWN_PATCH:
-                            open_[p] = True
-                        q = np.int64(patch[j])
-                        if q <= p:
+                        if patch[j] <= p:
                             continue
+                        if patch[j] == UNKNOWN:
+                            open_[p] = True
+                            continue
+                        q = np.int64(patch[j])
                         if votes[q, 0] == 0:
                             touched[n] = q
                             n += 1
