@@ -144,8 +144,7 @@ def split_square(low, c, parent, corner, size, patch, planes, params):
         norm = sqrt(1.0 + a * a + b * b)
         off = [(z - (h + a * x + b * y)) / norm for x, y, z in pts]
         inliers = sum(abs(r) <= params.inlier_distance for r in off)
-        enough = inliers >= 4 and inliers >= params.inlier_share * len(pts)
-        if enough and min(0.0, *off) > -params.division_distance:
+        if inliers >= 4 and inliers >= params.inlier_share * len(pts):
             divide = inliers < 0.9 * len(pts)
             taken = [
                 cell

@@ -91,6 +91,12 @@ def test_sensitivity_tries_each_value_alone(tile: Path, monkeypatch: pytest.Monk
     assert found["classification_distance"]["total"][0][1] == default
     assert found["classification_distance"]["total"][0][0] != default
     assert (tmp_path / "f17.svg").exists()
+    monkeypatch.setitem(sensitivity.RANGES, "robust", {"cell_size": (2,), "inlier_share": (0.5,), "tolerance": (0.2,)})
+    found = json.loads(run("sensitivity", tile, "--profile", "robust", "--json", "--plot", tmp_path / "odd"))[
+        "parameters"
+    ]
+    assert len(found) == 3
+    assert (tmp_path / "odd.svg").exists()
 
 
 def test_stages_command(tile: Path, cloud: labelled.Labelled, tmp_path: Path) -> None:

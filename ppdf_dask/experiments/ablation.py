@@ -19,7 +19,6 @@ ROBUST_CHANGES: dict[str, dict[str, Any]] = {
     "growth in one pass": {"passes": 1},
     "growth in 20 passes": {"passes": 20},
     "no nearest-reference rule": {"growth_step": 0.0},
-    "no reliability test (Eq. 2)": {"division_distance": 1000.0},
     "no share of inliers asked for": {"inlier_share": 0.0},
     "small patches are believed": {"smallest_patch": 0},
     "gentle borders count in full": {"border_gentle": 1.0},

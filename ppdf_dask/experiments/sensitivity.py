@@ -28,13 +28,12 @@ RANGES: dict[str, dict[str, Values]] = {
     "robust": {
         "cell_size": (1, 1.5, 2, 2.5, 3, 4, 5),
         "inlier_share": (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
-        "division_distance": (0.25, 0.5, 1, 1.5, 2, 3),
         "tolerance": (0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 1.0),
     },
 }
 """Values by profile and parameter: initial plane size, inliers, division distance and classification distance, and
-their counterparts in the robust profile, whose plane squares are 16 cells wide. The paper's own ranges are not
-readable; these span its defaults."""
+their counterparts in the robust profile, whose plane squares are 16 cells wide and know no division distance. The
+paper's own ranges are not readable; these span its defaults."""
 
 
 @dataclass(frozen=True)
@@ -128,12 +127,15 @@ def figure(found: Sensitivity) -> Figure:
         One panel per parameter with a common vertical axis; a dashed line marks the default, or, where that follows
         from the density, nothing.
     """
-    made = new_figure(9.6, 6.4)
-    panels = made.subplots(2, 2, sharey=True).ravel()
-    for axes, name in zip(panels, found.values, strict=True):
+    rows = -(-len(found.values) // 2)
+    made = new_figure(9.6, 3.2 * rows)
+    panels = made.subplots(rows, 2, sharey=True, squeeze=False).ravel()
+    for axes, name in zip(panels, found.values, strict=False):
         panel(found, name, axes)
-    panels[0].set_ylabel("total error, %")
-    panels[2].set_ylabel("total error, %")
+    for axes in panels[len(found.values) :]:
+        axes.remove()
+    for axes in panels[::2]:
+        axes.set_ylabel("total error, %")
     made.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
     return made
 

@@ -51,7 +51,7 @@ class Grid:
 
 
 GRIDS = (
-    Grid("ppdf", "robust", {"tolerance": (0.1, 0.2, 0.4), "division_distance": (0.5, 1.0, 2.0)}),
+    Grid("ppdf", "robust", {"tolerance": (0.1, 0.2, 0.4), "largest_building": (60.0, 120.0, 250.0)}),
     Grid("ppdf", "paper", {"classification_distance": (0.5, 1.0, 1.5, 2.0), "division_distance": (0.5, 1.0, 2.0)}),
     Grid("msf", "default", {"slope": (15.0, 20.0, 30.0, 45.0), "tolerance": (0.3, 0.6), "max_height": (3.0, 6.0)}),
     Grid("pmf", "default", {"slope": (15.0, 30.0, 45.0), "initial_height": (0.3, 0.5, 1.0), "window": (17.0, 33.0)}),

@@ -46,8 +46,6 @@ class RobustParams(Parameters):
         Perpendicular distance of inliers and seeds from their plane, m.
     inlier_share : float
         A plane needs this share of its square's low points (and at least 4).
-    division_distance : float
-        A plane with a low point this far below it or farther, perpendicularly, is not kept (paper, Eq. 2), m.
     smallest_patch : int
         Patches of fewer seeds are not believed.
     border_drop, border_reach, border_share : float
@@ -92,7 +90,6 @@ class RobustParams(Parameters):
     trials: int = quantity(30, "trials", low=1, high=10_000)
     inlier_distance: float = quantity(0.3, "m", low=0.01, high=5.0)
     inlier_share: float = quantity(0.5, "1", low=0.0, high=1.0)
-    division_distance: float = quantity(1.0, "m", low=0.01, high=1000.0)
     smallest_patch: int = quantity(8, "seeds", low=0, high=1000)
     border_drop: float = quantity(1.5, "m", low=0.0, high=100.0)
     border_reach: float = quantity(10.0, "m", low=0.0, high=100.0)

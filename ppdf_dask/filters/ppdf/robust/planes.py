@@ -103,7 +103,6 @@ def find_planes(cells: Cells, params: RobustParams) -> Patches:
         params.trials,
         params.inlier_distance,
         params.inlier_share,
-        params.division_distance,
         xs,
         ys,
         zs,
@@ -127,7 +126,6 @@ def _find_planes(
     trials: Any,
     t_in: Any,
     share: Any,
-    division: Any,
     xs: Any,
     ys: Any,
     zs: Any,
@@ -163,12 +161,9 @@ def _find_planes(
                 a, b, h = best[0], best[1], best[2]
                 norm = np.sqrt(1.0 + a * a + b * b)
                 inside = 0
-                deepest = 0.0
                 for m in range(n):
-                    r_m = (zs[m] - (h + a * xs[m] + b * ys[m])) / norm
-                    inside += abs(r_m) <= t_in
-                    deepest = min(deepest, r_m)
-                if inside >= 4 and inside >= share * n and deepest > -division:
+                    inside += abs(zs[m] - (h + a * xs[m] + b * ys[m])) / norm <= t_in
+                if inside >= 4 and inside >= share * n:
                     split = bool(inside < 0.9 * n)
                     taken = 0
                     for m in range(n):
