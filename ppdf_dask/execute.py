@@ -2,18 +2,22 @@
 
 Neither the client nor the scheduler ever holds more than the window, so their memory does not grow with the survey.
 What comes back together is fetched together, and what there is room for goes out together: each message costs the
-client, the scheduler and the workers a few milliseconds, however many pieces of work it is about.
-Keys are ``<stage>-<id>-<token>``: the dashboard groups by stage, ids can be searched, two runs do not collide.
+client, the scheduler and the workers a few milliseconds, however many pieces of work it is about. So does each task;
+pieces that take less than that travel several to a task. Each still publishes its own record when it is done.
+Keys are ``<stage>-<id>-<token>``, with ``+<n>`` after the id when n more pieces travel with it: the dashboard groups
+by stage, two runs do not collide.
 
 A piece of work that raises something unforeseen is tried again; one that says in plain words what is wrong (a
 `PpdfError`) would say it again and is not. When a worker dies, Dask blames every task that was on it: such work is
-tried again at the end of the stage, one piece at a time, so that only the culprit is given up.
+tried again at the end of the stage, one piece at a time, so that only the culprit is given up. A piece that raises in
+company sends those behind it back, and all of them are tried again alone.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import pickle
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -34,16 +38,19 @@ RETRIES = 2
 """How often a task that raised is tried again; a worker that died is counted by the scheduler itself."""
 
 WINDOW_PER_THREAD = 3
-"""Futures in flight per worker thread: one running, the next ones already there."""
+"""Tasks in flight per worker thread: one running, the next ones already there."""
 
 AHEAD = 1.0
 """Seconds of work in flight at least: pieces that take less than a message would else keep no worker busy."""
 
+OVERDUE = 1.0
+"""Seconds after which a task sends back what it has not begun: the pieces were expected to take a third of that."""
+
 LINGER = 0.05
 """Seconds that what came back waits for more to be fetched with it: the workers have their next pieces already."""
 
-WIDEST_PER_THREAD = 32
-"""Futures in flight per worker thread at most, however short the work is."""
+WIDEST_PER_THREAD = 128
+"""Pieces of work in flight per worker thread at most, however short they are."""
 
 POLL = 1.0
 """Seconds between two looks at scheduler and lock while no result comes."""
@@ -105,10 +112,12 @@ class _Flight:
     on_event: Listener
     check: Callable[[], None]
     arrived: SimpleQueue[Future[bytes]] = field(default_factory=SimpleQueue)
-    flying: dict[str, tuple[Work, Future[bytes]]] = field(default_factory=dict)
+    flying: dict[str, tuple[list[Work], Future[bytes]]] = field(default_factory=dict)
     tries: dict[str, int] = field(default_factory=dict)
     suspects: list[Work] = field(default_factory=list)
     room: int = 0
+    aloft: int = 0
+    together: int = 1
     landed: int = 0
     asked: float = float("-inf")
     alone: float | None = None
@@ -118,21 +127,34 @@ class _Flight:
         # A client that was closed no longer knows it.
         self.address = str(getattr(self.client.scheduler, "address", "?"))
 
-    def submit(self, works: list[Work]) -> None:
-        """Send pieces of work to the cluster, in one message."""
-        keys = [self._key(work) for work in works]
-        stage, jobs, fingerprints = self.stage, [w.job for w in works], [w.fingerprint for w in works]
-        functions, urls = [stage.function] * len(works), [stage.url] * len(works)
+    def submit(self, works: list[Work], together: int = 1) -> None:
+        """Send pieces of work to the cluster in one message, so many of them to a task."""
+        from distributed.protocol.pickle import dumps
+
+        stage, batches = self.stage, [works[k : k + together] for k in range(0, len(works), together)]
+        keys = [self._key(batch) for batch in batches]
+        # Packed here, a job is opened by its worker alone; the scheduler would else open and pack each anew.
+        packed = [dumps([(w.job, w.fingerprint) for w in batch]) for batch in batches]
+        functions, urls = [stage.function] * len(batches), [stage.url] * len(batches)
         with self._cluster_faults(works[0]):
-            futures = self.client.map(_packed, functions, urls, jobs, fingerprints, key=keys, pure=False)
-        self.flying.update(zip(keys, zip(works, futures, strict=True), strict=True))
-        for work, future in zip(works, futures, strict=True):
+            futures = self.client.map(_packed, functions, urls, packed, key=keys, pure=False)
+        self.flying.update(zip(keys, zip(batches, futures, strict=True), strict=True))
+        self.aloft += len(works)
+        for work in works:
             self.on_event(Event(stage.name, "sent", work.ident))
+        for future in futures:
             future.add_done_callback(self.arrived.put)
 
-    def _key(self, work: Work) -> str:
-        tries = self.tries[work.ident] = self.tries.get(work.ident, 0) + 1
-        return f"{self.stage.name}-{work.ident}-{self.stage.token}" + (f"-{tries}" if tries > 1 else "")
+    def _key(self, batch: list[Work]) -> str:
+        for work in batch:
+            self.tries[work.ident] = self.tries.get(work.ident, 0) + 1
+        first, more, tries = batch[0].ident, len(batch) - 1, self.tries[batch[0].ident]
+        return (
+            f"{self.stage.name}-{first}"
+            + (f"+{more}" if more else "")
+            + f"-{self.stage.token}"
+            + (f"-{tries}" if tries > 1 else "")
+        )
 
     def window(self) -> int:
         """Return how many pieces may fly; the cluster is asked once a second at most."""
@@ -141,7 +163,9 @@ class _Flight:
             with self._cluster_faults(None):
                 threads = sum(self.client.nthreads().values())
             busy = min(AHEAD * self.landed / (now - self.asked), WIDEST_PER_THREAD * threads)
-            self.room, self.asked, self.landed = max(4, WINDOW_PER_THREAD * threads, round(busy)), now, 0
+            tasks = max(4, WINDOW_PER_THREAD * threads)
+            self.room, self.asked, self.landed = max(tasks, round(busy)), now, 0
+            self.together = self.room // tasks
             self._say_when_alone(threads, now)
         return self.room
 
@@ -161,37 +185,51 @@ class _Flight:
     def land(self) -> Iterator[tuple[Work, dict[str, Any] | Failure]]:
         """Wait for work to come back; yield records and failures of what does not fly again."""
         back = [(future, self.flying.pop(str(future.key))[0]) for future in self._arrivals()]
-        self.landed += len(back)
-        records = self._fetch(back)
-        for future, work in back:
+        self.aloft -= sum(len(works) for _, works in back)
+        packed = self._fetch(back)
+        for future, works in back:
             error, trace = None, None
             if future.status == "error":
-                with self._cluster_faults(work):
+                with self._cluster_faults(works[0]):
                     error, trace = future.exception(), future.traceback()
             future.release()
-            outcome = (
-                (work, lean(json.loads(records[future.key]))) if error is None else self._judge(work, error, trace)
+            landed = (
+                self._open(works, packed[future.key])
+                if error is None
+                else filter(None, [self._judge(work, error, trace) for work in works])
             )
-            if outcome is not None:
+            for work, outcome in landed:
+                self.landed += 1
                 del self.tries[work.ident]
-                yield outcome
+                yield work, outcome
 
-    def _fetch(self, back: list[tuple[Future[bytes], Work]]) -> dict[Any, bytes]:
+    def _open(self, works: list[Work], packed: bytes) -> Iterator[tuple[Work, dict[str, Any]]]:
+        """Yield the records of a task; what it has not done flies again, each piece alone, and was not tried."""
+        records = json.loads(packed)
+        left = works[len(records) :]
+        for work in left:
+            self.tries[work.ident] -= 1
+        if left:
+            self.submit(left)
+        for work, record in zip(works, records, strict=False):
+            yield work, lean(record)
+
+    def _fetch(self, back: list[tuple[Future[bytes], list[Work]]]) -> dict[Any, bytes]:
         """Return the packed records of those that are finished, by key, in one message."""
         self._refuse_lost(back)
         finished = {future.key: future for future, _ in back if future.status == "finished"}
         if not finished:
             return {}
-        with self._cluster_faults(back[0][1]):
+        with self._cluster_faults(back[0][1][0]):
             # A record whose worker died meanwhile is made again; that can fail, or be the end of the scheduler.
             records: dict[Any, bytes] = self.client.gather(finished, errors="skip")
         self._refuse_lost(back)
         return records
 
-    def _refuse_lost(self, back: list[tuple[Future[bytes], Work]]) -> None:
-        for future, work in back:
+    def _refuse_lost(self, back: list[tuple[Future[bytes], list[Work]]]) -> None:
+        for future, works in back:
             if future.status not in ("finished", "error"):
-                raise self._lost(work)
+                raise self._lost(works[0])
 
     def _arrivals(self) -> list[Future[bytes]]:
         """Wait for a future that is done; return it and those that come soon after."""
@@ -258,9 +296,23 @@ class _Flight:
                 self.client.cancel(futures, force=True)
 
 
-def _packed(function: Callable[..., dict[str, Any]], url: str, job: Any, fingerprint: str) -> bytes:
-    """Run a piece of work; its record as it is in the ledger, else Dask measures and packs each value of it anew."""
-    return json.dumps(function(url, job, fingerprint)).encode()
+def _packed(function: Callable[..., dict[str, Any]], url: str, packed: bytes) -> bytes:
+    """Run pieces of work; their records as in the ledger, else Dask measures and packs each value of them anew.
+
+    Ends early when a piece raises in company, or when the pieces are longer than those before them were.
+    """
+    pieces, begin = pickle.loads(packed), time.monotonic()
+    records: list[dict[str, Any]] = []
+    for job, fingerprint in pieces:
+        try:
+            records.append(function(url, job, fingerprint))
+        except Exception:
+            if len(pieces) == 1:
+                raise
+            break
+        if time.monotonic() >= begin + OVERDUE:
+            break
+    return json.dumps(records).encode()
 
 
 def nothing() -> None:
@@ -300,13 +352,13 @@ def execute(
     waiting = iter(todo)
     try:
         while True:
-            works = list(islice(waiting, max(0, flight.window() - len(flight.flying))))
+            works = list(islice(waiting, max(0, flight.window() - flight.aloft)))
             if not works and not flight.flying:
                 if not flight.suspects:
                     return
                 works = [flight.suspects.pop(0)]
             if works:
-                flight.submit(works)
+                flight.submit(works, flight.together)
             for work, outcome in flight.land():
                 check()
                 if isinstance(outcome, Failure):

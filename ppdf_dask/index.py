@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ppdf_dask.ledger import digest
-from ppdf_dask.store import RunStore, record_path
+from ppdf_dask.store import RunStore, index_path
 
 Parts = dict[str, dict[str, tuple[int, str]]]
 """Part (core, buffer) to source to (points, fingerprint)."""
@@ -66,16 +66,24 @@ class Index:
         """Return the points of a chunk, its stored buffer included."""
         return sum(n for part in self.chunks[chunk].values() for n, _ in part.values())
 
+    def shards(self) -> dict[str, dict[str, Parts]]:
+        """Return what is written as one object each: its path to the chunks it is about."""
+        found: dict[str, dict[str, Parts]] = {}
+        for chunk, parts in self.chunks.items():
+            found.setdefault(index_path(chunk), {})[chunk] = parts
+        return found
+
     def publish(self, store: RunStore) -> None:
         """Write the index, and remove the fragments it does not know."""
-        if self.is_published(store) and all(store.has(record_path("index", chunk)) for chunk in self.chunks):
+        shards = self.shards()
+        if self.is_published(store) and all(map(store.has, shards)):
             return
         store.drop_record("index", "key")
-        for chunk, parts in self.chunks.items():
-            store.put_record("index", chunk, {"parts": parts})
-        for chunk in list(store.recorded("index")):
-            if chunk != "key" and chunk not in self.chunks:
-                store.drop_record("index", chunk)
+        for path, chunks in shards.items():
+            store.put_node(path, {"chunks": chunks})
+        for path in store.indexed():
+            if path not in shards:
+                store.drop(path)
         for path in list(self.orphans(store)):
             store.drop(path)
         store.put_record("index", "key", {"digest": digest(self.chunks)})
@@ -129,11 +137,10 @@ def fragments(store: RunStore, chunk: str, part: str) -> dict[str, npt.NDArray[n
 
 def parts_of(store: RunStore, chunk: str) -> Parts:
     """Return what a chunk consists of; nothing where the index knows of nothing."""
-    record = store.get_node(record_path("index", chunk))
-    return {} if record is None else record["parts"]
+    shard = store.get_node(index_path(chunk))
+    return {} if shard is None else shard["chunks"].get(chunk, {})
 
 
 def owns_points(store: RunStore, chunk: str) -> bool:
     """Tell whether a chunk has core points, so that it must have a classification."""
-    record = store.get_node(record_path("index", chunk))
-    return record is not None and bool(record["parts"]["core"])
+    return bool(parts_of(store, chunk).get("core"))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import AsyncIterator, Iterator
+from functools import lru_cache
 from typing import Any
 
 from zarr.core.buffer import default_buffer_prototype
@@ -39,7 +40,7 @@ class ObjectStore:
 
     def __init__(self, url: str) -> None:
         self.url = url
-        self._store = LocalStore(url)
+        self._store = _local(url)
 
     # Values go to the file system directly where zarr lets them: by way of its event loop and a thread of that loop, a
     # small one costs two to six times as much, and a run has several for each chunk.
@@ -112,6 +113,12 @@ def node_bytes(attributes: dict[str, Any]) -> bytes:
     """Return the value of a node."""
     node = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
     return json.dumps(node, sort_keys=True).encode()
+
+
+@lru_cache(maxsize=8)
+def _local(url: str) -> LocalStore:
+    # Opening one costs as much as a small value, and each task makes its own `ObjectStore`.
+    return LocalStore(url)
 
 
 async def _collect(names: AsyncIterator[str]) -> list[str]:

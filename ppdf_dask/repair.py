@@ -23,7 +23,7 @@ def maker(path: str) -> tuple[str, str] | None:
     --------
     >>> maker("chunks/c_0001_0002/core/s_000003"), maker("ground/c_0001_0002"), maker("dtm/height/c/0/1")
     (('tile', 's_000003'), ('classify', 'c_0001_0002'), ('raster', 'layout'))
-    >>> maker("ledger/index/c_0001_0/c_0001_0002"), maker("zarr.json")
+    >>> maker("ledger/index/c_0001_00"), maker("zarr.json")
     (('index', 'key'), None)
     """
     parts = path.removesuffix("/zarr.json").split("/")

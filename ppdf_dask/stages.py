@@ -208,8 +208,13 @@ class Cutting:
         """Return what a worker needs to classify a chunk."""
         p = self.inputs.plan
         return ClassifyJob(
-            p.grid.parse(chunk), self.cut, self.filter, self.buffer, self.widest, p.most_points, self.usual_points
+            p.grid.parse(chunk), self.cut, self.filter, self.buffer, self.widest, self.most_points, self.usual_points
         )
+
+    @cached_property
+    def most_points(self) -> float:
+        """Points for which a worker has memory."""
+        return self.inputs.plan.most_points
 
     @cached_property
     def usual_points(self) -> float:

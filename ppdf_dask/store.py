@@ -9,7 +9,7 @@ Layout of ``run.zarr`` (each leaf has exactly one writer)::
     ground/<chunk>                   int32 (3, n): the ground points, for the terrain model
     dtm/{height,distance,y,x}        float32 blocks of the global raster, one shard each
     ledger/<stage>/<shard>/<id>      what is done: a Zarr group whose attributes are the record (`record_path`)
-    ledger/index/<shard>/<chunk>     which fragments a chunk consists of, and of how many points (`ppdf_dask.index`)
+    ledger/index/<shard>             which fragments chunks consist of, and of how many points (`ppdf_dask.index`)
 
 Every object is written by one atomic put of its final bytes, an array's metadata after its data: no rename is needed of
 the store behind it, an array that is there is whole, and a task that runs twice at once does no harm. Every array
@@ -32,7 +32,7 @@ from zarr.storage import MemoryStore
 from ppdf_dask.errors import DamagedError, StoreError
 from ppdf_dask.objects import LEFTOVER, ObjectStore, node_bytes
 
-FORMAT = 4
+FORMAT = 5
 """Version of the layout above; a store of another version is refused."""
 
 # Bit shuffling in LZ4 packs the integers of a fragment into 5 % more bytes than zstd does (level 3), at a quarter of
@@ -294,6 +294,10 @@ class RunStore(ObjectStore):
         for shard in self.children(f"ledger/{stage}"):
             yield from self.children(f"ledger/{stage}/{shard}")
 
+    def indexed(self) -> list[str]:
+        """Return the paths of the shards of the index."""
+        return [f"ledger/index/{name}" for name in self.children("ledger/index") if name != "_"]
+
     def drop_record(self, stage: str, ident: str) -> None:
         """Remove a record: its work is to be done again."""
         self.delete(f"{record_path(stage, ident)}/zarr.json")
@@ -419,3 +423,14 @@ def record_path(stage: str, ident: str) -> str:
     ('ledger/classify/c_0012_3/c_0012_3456', 'ledger/index/_/key')
     """
     return f"ledger/{stage}/{ident[:-3] or '_'}/{ident}"
+
+
+def index_path(chunk: str) -> str:
+    """Return the path of a chunk's shard of the index: one object for up to a hundred chunks of a column.
+
+    Examples
+    --------
+    >>> index_path("c_0012_3456")
+    'ledger/index/c_0012_34'
+    """
+    return f"ledger/index/{chunk[:-2]}"

@@ -154,12 +154,14 @@ class _Check:
         published = self.cutting.index.is_published(self.store)
         if not published:
             self.report.pending.append("index key")
+        for path, chunks in self.cutting.index.shards().items() if published else ():
+            try:
+                shard = self.store.get_node(path)
+            except DamagedError:
+                shard = None
+            if shard is None or digest(shard.get("chunks")) != digest(chunks):
+                self._add("torn" if shard is None else "foreign", path, "is not what the tiles say")
         for chunk, parts in self.cutting.index.chunks.items():
-            record = self.store.get_record("index", chunk) if published else {"parts": parts}
-            if record is None or digest(record.get("parts")) != digest(parts):
-                self._add(
-                    "torn" if record is None else "foreign", record_path("index", chunk), "is not what the tiles say"
-                )
             if self.dropped:
                 self.report.counts["eligible"] += sum(n for n, _ in parts["core"].values())
                 continue

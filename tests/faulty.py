@@ -16,10 +16,14 @@ from types import SimpleNamespace
 from typing import Any
 
 from ppdf_dask.filters.ppdf import RobustParams
+from ppdf_dask.merge import MergeJob
 from ppdf_dask.objects import ObjectStore
 from ppdf_dask.params import ChunkParams, DtmParams, RunParams
 from ppdf_dask.plan import Plan, plan
+from ppdf_dask.raster import RasterJob
+from ppdf_dask.solve import ClassifyJob
 from ppdf_dask.survey import scan
+from ppdf_dask.tiler import TileJob
 
 
 class Inline:
@@ -45,13 +49,17 @@ class Inline:
         return [self._at_once(call, given, name) for *given, name in zip(*arguments, key, strict=True)]
 
     def _at_once(self, call: Any, given: list[Any], key: str) -> Any:
-        _, _, job, _ = given
-        self.ran.append("-".join(key.split("-")[:2]))
-        future = _Future(key)
-        try:
+        function, *rest = given
+        stage, future = key.partition("-")[0], _Future(key)
+
+        def faulty(url: str, job: Any, fingerprint: str) -> dict[str, Any]:
+            self.ran.append(f"{stage}-{_ident(job)}")
             if self._fault is not None:
                 self._fault(self.ran[-1], job)
-            future.record = call(*given)
+            return function(url, job, fingerprint)
+
+        try:
+            future.record = call(faulty, *rest)
         except Exception as error:
             future.error, future.status = error, "error"
         return future
@@ -61,6 +69,16 @@ class Inline:
 
     def cancel(self, futures: Any, force: bool) -> None:
         pass
+
+
+def _ident(job: Any) -> str:
+    if isinstance(job, MergeJob):
+        return job.tile.source
+    if isinstance(job, ClassifyJob):
+        return job.chunk.id
+    if isinstance(job, RasterJob):
+        return job.block.id
+    return job.source if isinstance(job, TileJob) else Path(job).name
 
 
 class _Future:

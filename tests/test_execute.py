@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
 
 import pytest
@@ -14,28 +15,32 @@ from ppdf_dask.quarantine import Failure
 
 
 def double(url, job, fingerprint):
-    return {"twice": 2 * job}
+    return {"twice": 2 * int(job[2:])}
 
 
 STAGE = execute.Stage("classify", double, "", "t")
 
 
 def works(n):
-    return [execute.Work(f"c_{k:04d}", 1, k, "") for k in range(n)]
+    return [execute.Work(f"c_{k:04d}", 1, f"c_{k:04d}", "") for k in range(n)]
 
 
 class Counting(Inline):
-    """Counts the pieces of each message; has two threads; `spoil` may change futures just before they are fetched."""
+    """Counts the tasks of each message and the pieces of each of them; has two threads.
+
+    `spoil` may change futures just before they are fetched.
+    """
 
     def __init__(self, fault=None, spoil=None):
         super().__init__(fault)
-        self.sent, self.fetched, self._spoil = [], [], spoil
+        self.sent, self.together, self.fetched, self._spoil = [], [], [], spoil
 
     def nthreads(self):
         return {"inline": 2}
 
     def map(self, *arguments, key, pure):
         self.sent.append(len(key))
+        self.together.append([len(pickle.loads(packed)) for packed in arguments[-1]])
         return super().map(*arguments, key=key, pure=pure)
 
     def gather(self, futures, errors):
@@ -47,26 +52,76 @@ class Counting(Inline):
 
 def test_what_goes_or_comes_together_is_one_message():
     client, todo = Counting(), works(20)
-    assert list(execute.execute(client, STAGE, todo, ignore)) == [(w, {"twice": 2 * w.job}) for w in todo]
+    assert list(execute.execute(client, STAGE, todo, ignore)) == [(w, {"twice": 2 * k}) for k, w in enumerate(todo)]
     assert client.sent == client.fetched == [6, 6, 6, 2]
 
 
-def test_the_window_widens_for_short_work_but_not_without_end(monkeypatch):
+@pytest.fixture
+def short(monkeypatch):
+    """Have every look at the window find that the pieces are as short as can be."""
     monkeypatch.setattr(execute, "POLL", 0.0)
+
+
+def test_short_pieces_travel_together_but_not_without_end(short):
     client = Counting()
-    assert len(list(execute.execute(client, STAGE, iter(works(500)), ignore))) == 500
-    assert client.sent[0] == 2 * execute.WINDOW_PER_THREAD
-    assert max(client.sent) == 2 * execute.WIDEST_PER_THREAD
+    assert len(list(execute.execute(client, STAGE, iter(works(1000)), ignore))) == 1000
+    tasks, widest = 2 * execute.WINDOW_PER_THREAD, 2 * execute.WIDEST_PER_THREAD
+    assert client.together[0] == [1] * tasks
+    assert max(map(sum, client.together)) == widest
+    # What does not divide evenly needs one more.
+    assert max(client.sent) == tasks + 1
+    assert max(map(max, client.together)) == widest // tasks
+
+
+def test_pieces_that_take_longer_travel_alone():
+    client = Counting()
+    list(execute.execute(client, STAGE, works(20), ignore))
+    assert {n for message in client.together for n in message} == {1}
+
+
+def test_a_piece_that_raises_in_company_is_given_up_alone(short):
+    def fault(name, job):
+        if job == "c_0030":
+            raise ValueError("never")
+
+    client, todo = Counting(fault), works(100)
+    found = dict(execute.execute(client, STAGE, todo, ignore))
+    assert {w.ident for w, outcome in found.items() if isinstance(outcome, Failure)} == {"c_0030"}
+    assert sorted(w.ident for w in found) == [w.ident for w in todo]
+    # Once in company, which ends there, and as often as any other alone.
+    assert Counter(client.ran) == {f"classify-{w.ident}": 1 + (1 + execute.RETRIES) * (w.job == "c_0030") for w in todo}
+
+
+def test_a_task_that_takes_too_long_sends_back_what_it_has_not_begun(short, monkeypatch):
+    monkeypatch.setattr(execute, "OVERDUE", 0.0)
+    client, todo = Counting(), works(100)
+    found = [w.ident for w, _ in execute.execute(client, STAGE, todo, ignore)]
+    assert sorted(found) == [w.ident for w in todo]
+    assert max(map(max, client.together)) > 1
+    assert set(Counter(client.ran).values()) == {1}
+
+
+def test_pieces_whose_worker_died_are_tried_again_one_at_a_time(short):
+    def spoil(futures):
+        for future in futures.values():
+            if "+" in future.key:
+                future.status, future.error, future.record = "error", KilledWorker(), None
+
+    client, todo = Counting(spoil=spoil), works(60)
+    found = dict(execute.execute(client, STAGE, todo, ignore))
+    assert sorted(w.ident for w in found) == [w.ident for w in todo]
+    assert not any(isinstance(outcome, Failure) for outcome in found.values())
+    assert client.together[-3:] == [[1], [1], [1]]
 
 
 def test_pieces_sent_together_are_tried_again_and_given_up_alone():
     def fault(name, job):
-        if job == 2:
+        if job == "c_0002":
             raise ValueError("never")
 
     client = Counting(fault)
     found = dict(execute.execute(client, STAGE, works(6), ignore))
-    assert {w.job for w, outcome in found.items() if isinstance(outcome, Failure)} == {2}
+    assert {w.ident for w, outcome in found.items() if isinstance(outcome, Failure)} == {"c_0002"}
     assert Counter(client.ran) == {f"classify-c_{k:04d}": 1 + execute.RETRIES * (k == 2) for k in range(6)}
 
 
@@ -77,7 +132,9 @@ def test_a_record_lost_before_it_was_fetched_is_made_again():
                 future.status, future.error, future.record = "error", KilledWorker(), None
 
     client = Counting(spoil=spoil)
-    assert dict(execute.execute(client, STAGE, works(6), ignore)) == {w: {"twice": 2 * w.job} for w in works(6)}
+    assert dict(execute.execute(client, STAGE, works(6), ignore)) == {
+        w: {"twice": 2 * k} for k, w in enumerate(works(6))
+    }
     assert client.sent == [6, 1]
 
 

@@ -21,7 +21,7 @@ from ppdf_dask.cli import group
 from ppdf_dask.errors import LockedError, ParameterError, PartialRunError, ResumeError, StoreError, SurveyError
 from ppdf_dask.lock import hold
 from ppdf_dask.params import ClassRules
-from ppdf_dask.store import RunStore, record_path
+from ppdf_dask.store import RunStore, index_path
 from ppdf_dask.verify import verify
 
 CHUNK = "c_0025_0024"
@@ -76,7 +76,7 @@ DAMAGE = [
     (flip, "dtm/height/c/0/0", "flipped", "dtm b_m0002_0001"),
     (remove, "dtm/height/c/0/0", "missing", "dtm b_m0002_0001"),
     (cut_off, "dtm/height/zarr.json", "torn", "raster layout"),
-    (cut_off, f"{record_path('index', CHUNK)}/zarr.json", "torn", "index key"),
+    (cut_off, f"{index_path(CHUNK)}/zarr.json", "torn", "index key"),
 ]
 
 
@@ -142,7 +142,7 @@ def test_f36_what_nobody_claims_is_listed_and_goes_away(tiles, undisturbed, run)
 
 @pytest.mark.parametrize(
     "path",
-    [f"{CORE}/c/0/0", f"chunks/{CHUNK}", "labels/s_000001", record_path("index", CHUNK), f"classification/{CHUNK}"],
+    [f"{CORE}/c/0/0", f"chunks/{CHUNK}", "labels/s_000001", index_path(CHUNK), f"classification/{CHUNK}"],
 )
 def test_a_run_finds_damage_itself_goes_back_and_mends_it(tiles, undisturbed, run, path):
     """Nobody asked `verify`: the stage that needs the object stumbles, its maker works again, then the stage."""

@@ -51,7 +51,7 @@ def test_a_country_is_planned_and_scheduled_with_records_of_every_task(tmp_path)
     assert found.stages["classify"]["tasks"] == found.chunks
     assert found.stages["merge"]["tasks"] == found.tiles
     assert found.tasks == sum(int(s["tasks"]) for s in found.stages.values())
-    assert not (tmp_path / "simulated").exists()
+    assert len(list(RunStore(str(tmp_path / "simulated" / "run.zarr")).recorded("classify"))) == found.chunks
     assert f"{found.chunks:,} chunks" in found.markdown()
 
 
