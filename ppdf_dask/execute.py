@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import pickle
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -301,7 +300,9 @@ def _packed(function: Callable[..., dict[str, Any]], url: str, packed: bytes) ->
 
     Ends early when a piece raises in company, or when the pieces are longer than those before them were.
     """
-    pieces, begin = pickle.loads(packed), time.monotonic()
+    from distributed.protocol.pickle import loads
+
+    pieces, begin = loads(packed), time.monotonic()
     records: list[dict[str, Any]] = []
     for job, fingerprint in pieces:
         try:
