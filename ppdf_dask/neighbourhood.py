@@ -16,7 +16,8 @@ Int32 = npt.NDArray[np.int32]
 Bools = npt.NDArray[np.bool_]
 
 KEPT_POINTS = 3_000_000
-"""Points of neighbouring cores a task keeps decoded (36 MB): the parts of a chunk ask for the same ones again."""
+"""Points of neighbouring cores a task keeps decoded, those of the cloud it works on included (36 MB): the parts of a
+chunk ask for the same ones again, and beside a large cloud, decoding again takes next to no time."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,10 @@ class Surroundings:
         """Points of the core."""
         return int(self.core.shape[1])
 
-    def xy(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Return the absolute coordinates of the core, mm."""
+    def xy(self, index: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return the absolute coordinates of points of the core, mm."""
         home = self._chunk.core
-        return self.core[0] + np.int64(home.x0), self.core[1] + np.int64(home.y0)
+        return self.core[0, index] + np.int64(home.x0), self.core[1, index] + np.int64(home.y0)
 
     def expect(self, part: Rect, width: int) -> float:
         """Return about how many points `cloud` would load, from the index alone."""
@@ -150,6 +151,7 @@ class Surroundings:
                 if other != self._chunk:
                     pieces.append(crop(self._neighbour(other), other.core, home, known))
         points = join([p for p in pieces if p.shape[1]])
+        self._make_room(points.shape[1])
         cloud = Cloud(
             x=points[0],
             y=points[1],
@@ -169,10 +171,13 @@ class Surroundings:
     def _neighbour(self, chunk: Chunk) -> Int32:
         if chunk.id not in self._kept:
             found = join(list(fragments(self._store, chunk.id, "core").values()))
-            while self._kept and sum(p.shape[1] for p in self._kept.values()) + found.shape[1] > KEPT_POINTS:
-                self._kept.pop(next(iter(self._kept)))
+            self._make_room(found.shape[1])
             self._kept[chunk.id] = found
         return self._kept[chunk.id]
+
+    def _make_room(self, n: int) -> None:
+        while self._kept and sum(p.shape[1] for p in self._kept.values()) + n > KEPT_POINTS:
+            self._kept.pop(next(iter(self._kept)))
 
 
 def unsure(cut: Cut, chunk: Chunk, near: Surroundings, reach: int) -> Bools:

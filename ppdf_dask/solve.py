@@ -14,10 +14,12 @@ import numpy.typing as npt
 
 from ppdf_dask import filters
 from ppdf_dask.grid import Chunk, Rect
+from ppdf_dask.heap import give_back
 from ppdf_dask.neighbourhood import Cut, Surroundings, unsure
 from ppdf_dask.params import Parameters
 from ppdf_dask.store import RunStore
 
+Bools = npt.NDArray[np.bool_]
 Int64 = npt.NDArray[np.int64]
 
 NARROW = 10_000
@@ -135,26 +137,37 @@ def solve(store: RunStore, job: ClassifyJob) -> Answer:
             if width > job.buffer and expected > job.most_points:
                 full = True
                 continue
-        cloud, index = near.cloud(part, width)
+        n, left = _attempt(near, job, (part, width), ground, unproven)
+        give_back()
         widest = max(widest, width)
-        loaded.append(cloud.n)
-        first += cloud.n if width == job.buffer else 0
-        verdict = chosen.classify(cloud, job.filter)
-        # What an earlier cloud proved stays: this one may see less on the far side.
-        index, seen = index[unproven[index]], unproven[index]
-        ground[index] = verdict.ground[seen]
-        unproven[index] = verdict.unproven[seen]
-        left = index[unproven[index] & ~lost[index]]
-        if len(left) == 0 or cloud.known is None or width >= job.max_buffer:
+        loaded.append(n)
+        first += n if width == job.buffer else 0
+        left = left[~lost[left]]
+        if len(left) == 0 or width >= job.max_buffer:
             continue
         if width > job.buffer and job.cut.near(part.grow(width)):
             continue  # What lies there stays unknown, however wide the buffer.
         wider = widened(max(width, job.cut.buffer), first=width == job.buffer, most=job.max_buffer)
-        x, y = near.xy()
-        todo += [(place, wider) for place in cover(x[left], y[left], wider)]
+        todo += [(place, wider) for place in cover(*near.xy(left), wider)]
     if len(near.core) > 3:
         ground |= near.core[3].astype(np.bool_)
     return Answer(near.core, near.counts, ground, unproven | lost, tuple(loaded), first, widest, full)
+
+
+def _attempt(
+    near: Surroundings, job: ClassifyJob, where: tuple[Rect, int], ground: Bools, unproven: Bools
+) -> tuple[int, Int64]:
+    """Classify one cloud and note what it tells; return its points, and which of its core a wider one could prove.
+
+    A function of its own because nothing else of the cloud may stay while the next one is loaded.
+    """
+    cloud, index = near.cloud(*where)
+    verdict = filters.of(job.filter).classify(cloud, job.filter)
+    # What an earlier cloud proved stays: this one may see less on the far side.
+    index, seen = index[unproven[index]], unproven[index]
+    ground[index] = verdict.ground[seen]
+    unproven[index] = verdict.unproven[seen]
+    return cloud.n, index[unproven[index]] if cloud.known is not None else index[:0]
 
 
 def widened(width: int, *, first: bool, most: int) -> int:

@@ -20,9 +20,10 @@ from typing import Any
 
 from ppdf_dask import raster
 from ppdf_dask.errors import DiskFullError
+from ppdf_dask.heap import give_back
 from ppdf_dask.ledger import Ledger
 from ppdf_dask.merge import MergeJob, crc32_of, write_tile
-from ppdf_dask.mosaic import open_dtm, write_cog
+from ppdf_dask.mosaic import export_cog
 from ppdf_dask.raster import RasterJob
 from ppdf_dask.repeats import repeats
 from ppdf_dask.solve import ClassifyJob, solve
@@ -56,8 +57,8 @@ class _Clock:
 Task = Callable[[str, Any, str], dict[str, Any]]
 
 
-def _says_when_full(function: Task) -> Task:
-    """Turn any error that comes of a full or closed disk into the one that ends the run early."""
+def _task(function: Task) -> Task:
+    """Turn any error of a full or closed disk into the one that ends the run early, and let go of freed memory."""
 
     @functools.wraps(function)
     def run(url: str, job: Any, fingerprint: str) -> dict[str, Any]:
@@ -71,6 +72,8 @@ def _says_when_full(function: Task) -> Task:
                 f"cannot write below {Path(url).parent} or the temporary folder {tempfile.gettempdir()}: {reason}; "
                 "free some space (`ppdf-dask plan` says how much a run needs) and give the same command again"
             ) from error
+        finally:
+            give_back()
 
     return run
 
@@ -86,7 +89,7 @@ def _no_room(error: BaseException | None, folder: Path) -> str | None:
     return None
 
 
-@_says_when_full
+@_task
 def tile(url: str, job: TileJob, fingerprint: str) -> dict[str, Any]:
     """Cut one source file into fragments."""
     clock, store = _Clock(), RunStore(url, fingerprint)
@@ -95,7 +98,7 @@ def tile(url: str, job: TileJob, fingerprint: str) -> dict[str, Any]:
     return record | {"fingerprint": fingerprint}
 
 
-@_says_when_full
+@_task
 def classify(url: str, job: ClassifyJob, fingerprint: str) -> dict[str, Any]:
     """Classify the core of one chunk and write mask and ground points."""
     clock, store = _Clock(), RunStore(url, fingerprint)
@@ -124,7 +127,7 @@ def classify(url: str, job: ClassifyJob, fingerprint: str) -> dict[str, Any]:
     return record | {"fingerprint": fingerprint}
 
 
-@_says_when_full
+@_task
 def merge(url: str, job: MergeJob, fingerprint: str) -> dict[str, Any]:
     """Write one source file again, classified."""
     clock, store = _Clock(), RunStore(url)
@@ -133,7 +136,7 @@ def merge(url: str, job: MergeJob, fingerprint: str) -> dict[str, Any]:
     return record
 
 
-@_says_when_full
+@_task
 def rasterize(url: str, job: RasterJob, fingerprint: str) -> dict[str, Any]:
     """Compute one block of the terrain model."""
     clock, store = _Clock(), RunStore(url)
@@ -142,12 +145,12 @@ def rasterize(url: str, job: RasterJob, fingerprint: str) -> dict[str, Any]:
     return record
 
 
-@_says_when_full
+@_task
 def export(url: str, target: str, fingerprint: str) -> dict[str, Any]:
     """Export the terrain model as a Cloud-Optimized GeoTIFF."""
     clock, store = _Clock(), RunStore(url)
     path = Path(target)
-    write_cog(open_dtm(url, dask=False), path)
+    export_cog(url, path)
     record = {"status": "done", "bytes": path.stat().st_size, "crc32": crc32_of(path), **clock.stamp()}
     Ledger(store).publish("cog", path.name, fingerprint, record)
     return record

@@ -29,7 +29,7 @@ def _slow(room: object, name: str) -> None:
 
 
 if "FAULTY_SLEEP" in os.environ:  # not when the test collection merely imports this file
-    for each in ("cut", "solve", "write_tile", "write_cog"):
+    for each in ("cut", "solve", "write_tile", "export_cog"):
         _slow(tasks, each)
     _slow(raster, "rasterize")
     tiler.SPILL_POINTS = int(os.environ.get("FAULTY_SPILL", tiler.SPILL_POINTS))

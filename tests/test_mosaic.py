@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import rasterio
@@ -7,7 +10,7 @@ from rio_cogeo.cogeo import cog_validate
 from ppdf_dask.dtm import BLOCK, DtmGrid, Raster
 from ppdf_dask.errors import PlanError, StoreError
 from ppdf_dask.grid import Rect
-from ppdf_dask.mosaic import open_dtm, raster_attributes, spatial_ref, write_cog
+from ppdf_dask.mosaic import export_cog, open_dtm, raster_attributes, spatial_ref, write_cog
 from ppdf_dask.params import DtmParams
 from ppdf_dask.store import RunStore
 
@@ -100,6 +103,24 @@ def test_the_same_raster_gives_the_same_bytes(tmp_path):
     path, _, _ = stored(tmp_path)
     a = write_cog(open_dtm(path), tmp_path / "a.tif").read_bytes()
     assert write_cog(open_dtm(path, dask=False), tmp_path / "b.tif").read_bytes() == a
+
+
+@pytest.mark.parametrize(("crs", "unit"), [(COMPOUND, 1.0), ("EPSG:2263", US_FOOT), (None, 1.0)])
+def test_the_export_of_a_run_is_the_same_file(tmp_path, crs, unit):
+    path, _, _ = stored(tmp_path, crs=crs, unit=unit)
+    a = write_cog(open_dtm(path), tmp_path / "a.tif").read_bytes()
+    assert export_cog(path, tmp_path / "b.tif").read_bytes() == a
+
+
+def test_the_export_of_a_run_does_not_load_xarray(tmp_path):
+    path, _, _ = stored(tmp_path)
+    code = (
+        "import sys; from ppdf_dask import tasks\n"
+        f"tasks.export({str(path)!r}, {str(tmp_path / 'dtm.tif')!r}, '')\n"
+        "print(sorted({'xarray', 'pandas', 'dask.array', 'rioxarray'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_a_slice_keeps_its_place(tmp_path):

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from ppdf_dask.experiments.processes import Usage, Watch, cluster
 from ppdf_dask.grid import MM, Rect
+from ppdf_dask.heap import give_back
 from ppdf_dask.params import RunParams
 from ppdf_dask.synthetic import SyntheticParams
 
@@ -202,6 +203,7 @@ def measure(client: Client, pids: dict[str, list[int]], tiles: list[Path], folde
     survey = scan([str(p) for p in tiles])
     made = plan(survey, params, out=folder / "run", memory=memory_per_worker(workers))
     copies = [copy_all(client, tiles, folder / "copy")]
+    client.run(give_back)  # What the copy has freed is not the job's.
     begin, spans = time.perf_counter(), dict[str, list[float]]()
 
     def hear(event: Event) -> None:
