@@ -346,10 +346,13 @@ def label(p, points_low, refs, high, blocks, c, radius, params, rough):
         return False
     found = quadrants(p, points_low, refs, c, radius)
     n, r, slope, d, _ = surface(p, found, c)
-    if n == 0 or r <= -(3.0 + slope * d):
+    if n == 0:
         return False
     levels = [z for _, z, _, _ in found.values()]
-    if slope > 1.0 and max(levels) - min(levels) > 5000 and p[2] <= max(levels):
+    deepest = 3.0 + slope * d
+    if slope > 1.0 and max(levels) - min(levels) > 5000 and min(levels) - 1.0e3 * deepest < p[2] <= max(levels):
         return True
+    if r <= -deepest:
+        return False
     tolerance = min(4.0 * params.tolerance, params.tolerance + params.roughness * rough * 1e-3)
     return not only_cliff and r < tolerance + (params.label_spread + params.label_slope * slope) * d

@@ -139,6 +139,15 @@ def test_the_rim_of_a_cliff_is_ground_what_stands_beside_it_is_not():
     assert not found[house | tree].any()
 
 
+def test_the_foot_of_a_high_cliff_is_ground_however_far_below_the_surface_through_top_and_foot():
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 400, (2, 32_000))
+    from_edge = x - 200 - 6 * np.sin(y / 12)
+    z = 30.0 * np.clip(from_edge / 1.5, 0, 1) + rng.normal(0, 0.03, len(x))
+    found = classify_ground(np.column_stack([x, y, z]))
+    assert found[(from_edge > -3) & (from_edge < 1.5)].all()  # without the rule 0.97
+
+
 @pytest.mark.parametrize(("far", "ground"), [("reference", True), ("none", False), ("unproven", None)])
 def test_a_cliff_that_hangs_on_an_unproven_cell_is_unproven(far, ground):
     """The cell at (39, 39) decides whether there is a cliff in the blocks around, beyond all that the search sees."""

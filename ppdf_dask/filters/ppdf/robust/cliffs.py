@@ -63,8 +63,12 @@ def _find_tops(width: Any, pos: Any, state: Any, spans: Any, tops: Any) -> None:
 
 
 @leaf
-def at_cliff(pos: Any, z: Any, found: Any, at: Any, slope: Any) -> Any:
-    """Tell whether the references `found` from `at` on make a cliff, and `z` lies no higher than one of them."""
+def at_cliff(pos: Any, z: Any, found: Any, at: Any, slope: Any, deepest: Any) -> Any:
+    """Tell whether the references `found` from `at` on make a cliff, and `z` lies between them.
+
+    That is no higher than the highest and less than `deepest` metres below the lowest: foot and face lie far below the
+    surface through top and foot.
+    """
     if slope <= STEEP:
         return False
     bottom, top = np.int64(NOWHERE), np.int64(NO_CLIFF)
@@ -72,4 +76,4 @@ def at_cliff(pos: Any, z: Any, found: Any, at: Any, slope: Any) -> Any:
         if found[q] >= 0:
             height = np.int64(pos[found[q], 2])
             bottom, top = min(bottom, height), max(top, height)
-    return z <= top and top - bottom > HEIGHT
+    return bottom - 1e3 * deepest < z <= top and top - bottom > HEIGHT

@@ -170,14 +170,15 @@ def _decide(
         big = of_point[i]
         r, slope, d = answer[m, HEIGHT], answer[m, SLOPE], answer[m, DISTANCE]
         unknown = not all_known and count_within(unproven_cells, width, place[m, CELL], place[m, RINGS]) > 0
-        if place[m, COUNT] > 0 and r > -(3.0 + slope * d):
+        deepest = 3.0 + slope * d
+        if place[m, COUNT] > 0 and at_cliff(pos, place[m, Z], found, 8 * m, slope, deepest):
+            ground[i] = True
+        elif place[m, COUNT] > 0 and not only_cliff and r > -deepest:
             rise = (rule.spread + rule.slope * slope) * d
-            if at_cliff(pos, place[m, Z], found, 8 * m, slope):
-                ground[i] = True
-            elif not only_cliff and rough[big] == NOT_KNOWN:
+            if rough[big] == NOT_KNOWN:
                 ground[i] = r < rule.tolerance + rise
                 unknown |= ground[i] != (r < 4.0 * rule.tolerance + rise)
-            elif not only_cliff:
+            else:
                 most = min(4.0 * rule.tolerance, rule.tolerance + rule.roughness * rough[big] * 1e-3)
                 ground[i] = r < most + rise
         unproven[i] |= unknown
