@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from ppdf_dask.result import Result
     from ppdf_dask.submit import Submission
 
-WORKER_MB = 350.0
+WORKER_MB = 310.0
 """Resident size of a worker that has imported everything and compiled its kernels, measured."""
 
-TILE_BYTES = 110.0
+TILE_BYTES = 130.0
 """Bytes per point of the batch in flight while a tile is decoded or written, measured."""
 
 BATCH_POINTS = 1_000_000
@@ -99,10 +99,10 @@ class Plan:
         """The chunks, densest first, with their expected numbers of eligible points."""
         return _estimate(self.survey, self.grid, self.buffer, self.params.returns == "last")
 
-    @property
+    @cached_property
     def bytes_per_point(self) -> float:
         """Memory a task needs for each point it loads, in bytes: as read, as joined, and the filter's own."""
-        return _bytes_per_point(self.params)
+        return _bytes_per_point(self.params, _density(self.survey, self.params))
 
     @property
     def most_points(self) -> float:
@@ -308,8 +308,15 @@ def plan(
     return Plan(survey, params, Path(out).absolute(), grid, width, memory)
 
 
-def _bytes_per_point(params: RunParams) -> float:
-    return 24.0 + filters.of(params.filter).bytes_per_point
+def _bytes_per_point(params: RunParams, density: float) -> float:
+    own = filters.of(params.filter).bytes_per_point
+    return 24.0 + (own(params.filter, density) if callable(own) else own)
+
+
+def _density(survey: Survey, params: RunParams) -> float:
+    """Points a filter sees per square metre of all tiles."""
+    last = params.returns == "last"
+    return sum(_eligible(t, last) for t in survey.tiles) / max(_area_mm2(survey), 1) * MM**2
 
 
 def _eligible(tile: Tile, last: bool) -> float:
@@ -358,7 +365,7 @@ def _choose(survey: Survey, params: RunParams, buffer: int, memory: float) -> Ch
 
     Enough does not grow with the survey, so that the memory of a worker and the time per point do not either.
     """
-    fits = (0.6 * memory - WORKER_MB * 1e6) / _bytes_per_point(params)
+    fits = (0.6 * memory - WORKER_MB * 1e6) / _bytes_per_point(params, _density(survey, params))
     last = params.returns == "last"
     total = sum(_eligible(t, last) for t in survey.tiles)
     densest = max((_eligible(t, last) / max(_extent(t), 1) for t in survey.tiles), default=0.0)

@@ -1,5 +1,7 @@
 """The robust profile: proof against cutting, order, duplicates, degenerate input."""
 
+import tracemalloc
+
 import numpy as np
 import oracle_robust
 import pytest
@@ -8,7 +10,7 @@ from hypothesis import strategies as st
 
 from ppdf_dask.errors import ParameterError
 from ppdf_dask.filters import classify_ground, get
-from ppdf_dask.filters.cloud import Cloud, Density, cloud_from_grid
+from ppdf_dask.filters.cloud import Cloud, Density, cloud_from_grid, density
 from ppdf_dask.filters.ppdf.robust import windows
 from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
 from ppdf_dask.filters.ppdf.robust.classify import classify
@@ -297,3 +299,20 @@ def test_the_cells_follow_the_density(points, cells, size, parts):
 def test_an_unresolved_cell_size_is_refused():
     with pytest.raises(ParameterError, match="cell_size is not set"):
         get("ppdf").classify(cloud_from_grid(*scene(1).T), RobustParams())
+
+
+@pytest.mark.parametrize(("per_m2", "n"), [(0.25, 200_000), (1.0, 400_000), (4.0, 600_000), (10.0, 1_500_000)])
+def test_the_planner_knows_the_memory_of_the_filter(per_m2, n):
+    """Above a hundred thousand cells, where points are put in order; the room of a batch is the rest."""
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, round(1000 * (n / per_m2) ** 0.5), (2, n))
+    z = 3000 * np.sin(x / 40_000) + (rng.random(n) < 0.4) * rng.uniform(2000, 20_000, n)
+    cloud, ppdf = cloud_from_grid(x, y, z.astype(np.int64)), get("ppdf")
+    params = RobustParams().resolve(density(cloud))
+    classify(cloud, params)  # compiles
+    tracemalloc.start()
+    classify(cloud, params)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert callable(ppdf.bytes_per_point)
+    assert peak / n == pytest.approx(ppdf.bytes_per_point(params, per_m2), rel=0.25)

@@ -44,8 +44,9 @@ class Filter:
         True when the filter proves its answers (fills `Verdict.unproven`); then no seam can show.
     resolve : callable
         ``resolve(params, density) -> Parameters``: makes what is derived from the job-wide density explicit.
-    bytes_per_point : float
-        Peak memory per loaded point above the 12 bytes of the points themselves; for the planner.
+    bytes_per_point : float or callable
+        Peak memory per loaded point above the 12 bytes of the points themselves, for the planner; where it depends on
+        the profile or the points per square metre, ``bytes_per_point(params, density) -> float``.
     """
 
     name: str
@@ -54,7 +55,7 @@ class Filter:
     required_buffer: Callable[[Parameters], float]
     exact: bool
     resolve: Callable[[Parameters, Density], Parameters]
-    bytes_per_point: float
+    bytes_per_point: float | Callable[[Parameters, float], float]
 
 
 @cache

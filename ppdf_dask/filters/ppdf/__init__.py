@@ -11,6 +11,7 @@ from ppdf_dask.filters import Filter
 from ppdf_dask.filters.cloud import Cloud, Density, Verdict
 from ppdf_dask.filters.ppdf.paper.params import PaperParams
 from ppdf_dask.filters.ppdf.robust.params import RobustParams
+from ppdf_dask.grid import MM
 from ppdf_dask.params import Parameters
 
 
@@ -36,6 +37,14 @@ def _resolve(params: Parameters, density: Density) -> Parameters:
     return params.resolve(density) if isinstance(params, RobustParams) else params
 
 
+def _bytes_per_point(params: Parameters, density: float) -> float:
+    """Return what was measured: the robust profile has 30 bytes for a point and 50 for a cell, 180 with halved ones."""
+    if not isinstance(params, RobustParams):
+        return 90.0
+    resolved = params.resolve(Density(max(1, round(density * 25_000)), 1000))
+    return 30.0 + (180.0 if resolved.refinement == 2 else 50.0) / (max(density, 0.04) * (resolved.cell_mm / MM) ** 2)
+
+
 FILTER = Filter(
     name="ppdf",
     profiles={"robust": RobustParams(), "paper": PaperParams()},
@@ -43,5 +52,5 @@ FILTER = Filter(
     required_buffer=_required_buffer,
     exact=True,
     resolve=_resolve,
-    bytes_per_point=108.0,
+    bytes_per_point=_bytes_per_point,
 )
