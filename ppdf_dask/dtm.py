@@ -73,7 +73,7 @@ Load = Callable[[Rect], Iterable[Part]]
 """Gives parts that hold at least the ground points inside a rectangle."""
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True, order=True, slots=True)
 class Block:
     """A square of `BLOCK` x `BLOCK` pixels; `row` counts downward, `col` to the right, from absolute zero."""
 

@@ -58,7 +58,11 @@ PATIENCE = 15.0
 """Seconds without any worker after which the user hears of it: more than a worker takes to be started again."""
 
 
-@dataclass(frozen=True)
+def _as_given(given: Any) -> Any:
+    return given
+
+
+@dataclass(frozen=True, slots=True)
 class Work:
     """One piece of work of a stage.
 
@@ -68,16 +72,25 @@ class Work:
         Chunk, source or block id.
     points : int
         What it counts for in the progress.
-    job : object
-        First argument after the store's path; small, picklable.
+    given : object
+        What the job is made of.
     fingerprint : str
         What its record is published with.
+    make : callable
+        Makes the job of what is given, when it is sent: a million jobs made in advance are most of a driver's memory.
+        Default: what is given is the job.
     """
 
     ident: str
     points: int
-    job: Any
+    given: Any
     fingerprint: str
+    make: Callable[[Any], Any] = _as_given
+
+    @property
+    def job(self) -> Any:
+        """First argument of a stage's function after the store's path; small, picklable."""
+        return self.make(self.given)
 
 
 @dataclass(frozen=True)

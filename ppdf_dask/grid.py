@@ -21,7 +21,7 @@ DENSITY_CELL = 5 * MM
 """Edge of the absolute cells over which the point density is counted; chunk edges are multiples of it."""
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True, order=True, slots=True)
 class Rect:
     """A half-open rectangle in absolute millimetres: ``x0 <= x < x1`` and ``y0 <= y < y1``."""
 
@@ -70,7 +70,7 @@ class Rect:
         return self.x0 / MM, self.y0 / MM, self.x1 / MM, self.y1 / MM
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True, order=True, slots=True)
 class Chunk:
     """A unit of work: the square of a `ChunkGrid` with column `ix` and row `iy`."""
 

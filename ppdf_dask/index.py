@@ -59,8 +59,8 @@ class Index:
     @property
     def points(self) -> dict[str, int]:
         """Core points of each chunk that has any."""
-        found = {chunk: sum(n for n, _ in parts["core"].values()) for chunk, parts in self.chunks.items()}
-        return {chunk: n for chunk, n in found.items() if n}
+        counts = ((chunk, sum(n for n, _ in parts["core"].values())) for chunk, parts in self.chunks.items())
+        return {chunk: n for chunk, n in counts if n}
 
     def loaded(self, chunk: str) -> int:
         """Return the points of a chunk, its stored buffer included."""
@@ -75,8 +75,8 @@ class Index:
 
     def publish(self, store: RunStore) -> None:
         """Write the index, and remove the fragments it does not know."""
-        shards = self.shards()
-        if self.is_published(store) and all(map(store.has, shards)):
+        shards, key = self.shards(), {"digest": digest(self.chunks)}
+        if store.get_record("index", "key") == key and all(map(store.has, shards)):
             return
         store.drop_record("index", "key")
         for path, chunks in shards.items():
@@ -86,7 +86,7 @@ class Index:
                 store.drop(path)
         for path in list(self.orphans(store)):
             store.drop(path)
-        store.put_record("index", "key", {"digest": digest(self.chunks)})
+        store.put_record("index", "key", key)
 
     def is_published(self, store: RunStore) -> bool:
         """Tell whether this index, and no older one, was written to its end."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -26,9 +27,25 @@ def digest(value: Any) -> str:
     --------
     >>> digest({"b": 1, "a": [2]}) == digest({"a": [2], "b": 1})
     True
+    >>> hashlib.sha256(b'{"a":[2],"b":1}').hexdigest().startswith(digest({"b": 1, "a": [2]}))
+    True
     """
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    found = hashlib.sha256()
+    for text in _json(value):
+        found.update(text.encode())
+    return found.hexdigest()[:16]
+
+
+def _json(value: Any) -> Iterator[str]:
+    """Yield JSON in pieces: in one it would be the largest thing in the memory of a driver."""
+    pack = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
+    if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
+        yield pack(value)
+        return
+    yield "{"
+    for k, name in enumerate(sorted(value)):
+        yield ("," if k else "") + pack(name) + ":" + pack(value[name])
+    yield "}"
 
 
 @dataclass(frozen=True)
@@ -95,12 +112,14 @@ class Ledger:
         wanted : dict
             Id to the fingerprint its record must carry.
         """
-        found = {}
+        return dict(self.each_done(stage, wanted))
+
+    def each_done(self, stage: Stage, wanted: dict[str, str]) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield id and record of what `done` returns, one by one."""
         for ident, fingerprint in wanted.items():
             record = self.store.get_record(stage, ident)
             if record is not None and record.get("fingerprint") == fingerprint:
-                found[ident] = lean(record)
-        return found
+                yield ident, lean(record)
 
 
 def lean(record: dict[str, Any]) -> dict[str, Any]:

@@ -52,14 +52,25 @@ MANY_BUFFERS = 4
 """A chunk is at least so many buffers wide where memory allows: then buffers are at most 5/4 of the core's points."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ChunkEstimate:
-    """What the headers let expect of one chunk."""
+    """What the headers let expect of one chunk; its place is worked out when asked for, a plan may have a million."""
 
-    id: str
-    core: Rect
+    grid: ChunkGrid
+    ix: int
+    iy: int
     points: float
     loaded: float
+
+    @property
+    def id(self) -> str:
+        """The chunk's id."""
+        return self.grid.chunk(self.ix, self.iy).id
+
+    @property
+    def core(self) -> Rect:
+        """The chunk's core."""
+        return self.grid.chunk(self.ix, self.iy).core
 
 
 @dataclass(frozen=True)
@@ -350,9 +361,7 @@ def _estimate(survey: Survey, grid: ChunkGrid, buffer: int, last: bool) -> list[
             if inside:
                 points[key] = points.get(key, 0.0) + per_area * inside
             loaded[key] = loaded.get(key, 0.0) + per_area * _area(b, chunk.core.grow(buffer))
-    found = [
-        ChunkEstimate(grid.chunk(*key).id, grid.chunk(*key).core, n, loaded[key]) for key, n in sorted(points.items())
-    ]
+    found = [ChunkEstimate(grid, *key, n, loaded[key]) for key, n in sorted(points.items())]
     return sorted(found, key=lambda c: (-c.loaded, c.id))
 
 

@@ -33,7 +33,7 @@ from ppdf_dask.raster import create
 from ppdf_dask.repair import heal, sweep, take_notes
 from ppdf_dask.repeats import shared_problems
 from ppdf_dask.saved import save_plan
-from ppdf_dask.stages import Cutting, Inputs, Records, Waiting
+from ppdf_dask.stages import Cutting, Inputs, Records, Waiting, brief
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiles import Problem, problem_dict, shown
 
@@ -216,10 +216,12 @@ class _Run:
         works: Iterable[Work],
         still_good: Callable[[str, dict[str, Any]], bool] = lambda ident, record: True,
     ) -> Records:
-        """Do what the ledger does not hold yet; return all records of the stage."""
-        works = list(works)
-        found = self.ledger.done(name, {w.ident: w.fingerprint for w in works})
-        records = {ident: record for ident, record in found.items() if still_good(ident, record)}
+        """Do what the ledger does not hold yet; return of all records of the stage what is still asked of them."""
+        works, records, took = list(works), Records(), _Total()
+        for ident, record in self.ledger.each_done(name, {w.ident: w.fingerprint for w in works}):
+            if still_good(ident, record):
+                took.add(record)
+                records[ident] = brief(name, record)
         todo = [w for w in works if w.ident not in records and (name, w.ident) not in self.failures]
         total = sum(w.points for w in works)
         resumed = sum(w.points for w in works if w.ident in records)
@@ -237,12 +239,13 @@ class _Run:
         stage = Stage(name, function, self.store.url, digest([self.store.url, os.getpid()])[:8])
         for item, outcome in execute(self.client, stage, todo, self.on_event, self.check):
             if not isinstance(outcome, Failure):
-                records[item.ident] = outcome
+                took.add(outcome)
+                records[item.ident] = brief(name, outcome)
             elif outcome.damaged:
                 self.damaged.append(outcome.damaged)
             else:
                 self.failures[name, item.ident] = outcome
-        self.totals[name] = _summary(records)
+        self.totals[name] = took.as_dict()
         return records
 
     def _remove_outdated(self, stage: StageName, ident: str, fingerprint: str, path: Path) -> None:
@@ -383,14 +386,24 @@ def _check_targets(plan: Plan) -> None:
             raise SurveyError(f"{target} is an input; inputs are never written to: choose another --out")
 
 
-def _summary(records: Records) -> dict[str, Any]:
-    values = records.values()
-    return {
-        "tasks": len(records),
-        "seconds": round(sum(r["seconds"] for r in values), 3),
-        "cpu_seconds": round(sum(r["cpu_seconds"] for r in values), 3),
-        "peak_mb": max((r["peak_mb"] for r in values), default=0.0),
-    }
+@dataclass
+class _Total:
+    """What a stage took, summed up as its records come."""
+
+    tasks: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    peak_mb: float = 0.0
+
+    def add(self, record: dict[str, Any]) -> None:
+        self.tasks += 1
+        self.seconds += record["seconds"]
+        self.cpu_seconds += record["cpu_seconds"]
+        self.peak_mb = max(self.peak_mb, record["peak_mb"])
+
+    def as_dict(self) -> dict[str, Any]:
+        seconds, cpu = round(self.seconds, 3), round(self.cpu_seconds, 3)
+        return {"tasks": self.tasks, "seconds": seconds, "cpu_seconds": cpu, "peak_mb": self.peak_mb}
 
 
 def _same_size(path: Path, record: dict[str, Any]) -> bool:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 from ppdf_dask import __version__, filters
 from ppdf_dask.codeprint import code
 from ppdf_dask.dropped import are_dropped, kept_density
-from ppdf_dask.dtm import DtmGrid, Raster
+from ppdf_dask.dtm import Block, DtmGrid, Raster
 from ppdf_dask.execute import Work
 from ppdf_dask.filters.cloud import Density
 from ppdf_dask.grid import MM, Rect
@@ -32,11 +32,26 @@ from ppdf_dask.tiler import TileJob, unpack_cells
 
 Records = dict[str, dict[str, Any]]
 
+KEPT = {"classify": ("ground", "unproven", "repeated", "shared"), "merge": ("points",), "dtm": ()}
+"""What a driver keeps of the records of the stages with most pieces, until the end of a run."""
+
 SMALL = 2_000_000.0
 """Points of a cloud that take so little memory that cutting it for that would be a waste of time."""
 
 
-@dataclass(frozen=True)
+def brief(stage: str, record: dict[str, Any]) -> dict[str, Any]:
+    """Return what a driver still asks of a record when its stage is over.
+
+    Examples
+    --------
+    >>> brief("merge", {"points": 3, "crc32": 1, "seconds": 0.5})
+    {'points': 3}
+    """
+    kept = KEPT.get(stage)
+    return record if kept is None else {name: record[name] for name in kept if name in record}
+
+
+@dataclass(frozen=True, slots=True)
 class Waiting:
     """A piece of work that cannot be done because another one failed."""
 
@@ -101,7 +116,8 @@ class Inputs:
 
     def tile_works(self) -> list[Work]:
         """Return the work of the tile stage, largest first."""
-        works = [Work(s, t.point_count, self.tile_job(s), self.tile_keys[s]) for s, t in self.sources.items()]
+        make = self.tile_job
+        works = [Work(s, t.point_count, s, self.tile_keys[s], make) for s, t in self.sources.items()]
         return sorted(works, key=lambda w: (-w.points, w.ident))
 
 
@@ -224,7 +240,8 @@ class Cutting:
     def classify_works(self) -> list[Work]:
         """Return the work of the classify stage, densest chunk first."""
         chunks = sorted(self.index.points.items(), key=lambda item: (-item[1], item[0]))
-        return [Work(chunk, n, self.classify_job(chunk), self.classify_key) for chunk, n in chunks]
+        key, make = self.classify_key, self.classify_job
+        return [Work(chunk, n, chunk, key, make) for chunk, n in chunks]
 
     def still_proven(self, record: dict[str, Any]) -> bool:
         """Tell whether a chunk's record is the best that can be had: proven, or as wide as is allowed."""
@@ -249,7 +266,7 @@ class Cutting:
         """Return the tiles whose chunks are all classified, largest first, and those that wait."""
         works: list[Work] = []
         waiting: list[Waiting] = []
-        dropped = are_dropped(self.store)
+        make = partial(self._merge_job, dropped=are_dropped(self.store))
         for source, tile in self.inputs.sources.items():
             if source not in self.tiles:
                 continue
@@ -257,16 +274,13 @@ class Cutting:
             if missing:
                 waiting.append(Waiting("merge", source, f"chunk {missing[0]} is not classified"))
                 continue
-            labels = 0 if dropped else self.index.labels[source]
-            job = MergeJob(
-                self.inputs.tile_job(source),
-                self.target(source),
-                self.classify_key,
-                labels,
-                self.inputs.tile_keys[source],
-            )
-            works.append(Work(source, tile.point_count, job, self.merge_key(source)))
+            works.append(Work(source, tile.point_count, source, self.merge_key(source), make))
         return sorted(works, key=lambda w: (-w.points, w.ident)), waiting
+
+    def _merge_job(self, source: str, *, dropped: bool) -> MergeJob:
+        labels = 0 if dropped else self.index.labels[source]
+        key = self.inputs.tile_keys[source]
+        return MergeJob(self.inputs.tile_job(source), self.target(source), self.classify_key, labels, key)
 
     # -- terrain model --------------------------------------------------------------------------------------------
 
@@ -286,19 +300,24 @@ class Cutting:
         p = self.inputs.plan
         lost = {p.grid.parse(c).core: n for c, n in self.index.points.items() if c not in chunks}
         lost |= dict.fromkeys(self.unknown, 1)
-        ground = {p.grid.parse(c).core: r["ground"] for c, r in chunks.items() if r["ground"]}
+        places = {p.grid.parse(c).core: r["ground"] for c, r in chunks.items() if r["ground"]}
         # A block's proof reads ground up to two limits around it.
         reach = 2 * round(max(p.params.dtm.max_edge, p.params.dtm.fill_edge or 0.0) * MM)
+        make = self._raster_job
         works: list[Work] = []
         waiting: list[Waiting] = []
-        for block, points in jobs(self.raster, ground | lost, p.params.dtm):
+        places |= lost
+        for block, points in jobs(self.raster, places, p.params.dtm):
             around = block.rect.grow(reach)
             if any(around.intersects(place) for place in lost):
                 waiting.append(Waiting("dtm", block.id, "ground around it is not known"))
             else:
-                job = RasterJob(block, self.raster, self.cut, p.params.dtm, p.survey.unit_z)
-                works.append(Work(block.id, points, job, self.raster_key))
+                works.append(Work(block.id, points, block, self.raster_key, make))
         return works, waiting
+
+    def _raster_job(self, block: Block) -> RasterJob:
+        p = self.inputs.plan
+        return RasterJob(block, self.raster, self.cut, p.params.dtm, p.survey.unit_z)
 
     def cog_work(self, works: list[Work], waiting: list[Waiting]) -> Work:
         """Return the export: ``dtm.tif``, or ``dtm.partial.tif`` while blocks are missing."""

@@ -73,6 +73,20 @@ def test_short_pieces_travel_together_but_not_without_end(short):
     assert max(map(max, client.together)) == widest // tasks
 
 
+def test_a_job_is_made_when_it_is_sent():
+    made, ahead = [], []
+
+    def make(given):
+        made.append(given)
+        return given
+
+    todo = [execute.Work(w.ident, 1, w.job, "", make) for w in works(20)]
+    for k, _ in enumerate(execute.execute(Counting(), STAGE, todo, ignore)):
+        ahead.append(len(made) - k)
+    assert sorted(made) == [w.ident for w in todo]
+    assert max(ahead) == 2 * execute.WINDOW_PER_THREAD
+
+
 def test_pieces_that_take_longer_travel_alone():
     client = Counting()
     list(execute.execute(client, STAGE, works(20), ignore))

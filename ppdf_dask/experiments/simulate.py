@@ -20,7 +20,7 @@ from ppdf_dask.grid import MM, Rect
 from ppdf_dask.ledger import Ledger
 from ppdf_dask.params import ChunkParams, DtmParams, RunParams
 from ppdf_dask.quarantine import Failure
-from ppdf_dask.stages import Cutting, Inputs, Records
+from ppdf_dask.stages import Cutting, Inputs, Records, brief
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import Survey
 from ppdf_dask.tiles import Tile
@@ -175,7 +175,7 @@ def _stage(
     for work, outcome in execute(client, Stage(name, pretend, store.url, "pretended"), works, lambda event: None):
         if isinstance(outcome, Failure):
             raise AssertionError(outcome.detail)
-        records[work.ident] = outcome
+        records[work.ident] = brief(name, outcome)
     seconds = time.perf_counter() - begin
     stages[name] = {"tasks": len(records), "seconds": round(seconds, 2), "per_second": round(len(records) / seconds, 1)}
     return records
