@@ -314,10 +314,18 @@ class Triangulation:
         """Insert points, (n, 3); of several at one (x, y) the lowest stays."""
         if len(points) == 0:
             return
-        room = self._count + len(points)
-        vertices = np.empty((room, 3), dtype=np.int32)
-        vertices[: self._count] = self.vertices
-        triangles = np.empty((2 * room - 6, 6), dtype=np.int32)
-        triangles[: 2 * self._count - 6] = self.triangles
-        self._count = int(_insert(points, curve_order(points), vertices, triangles, self._count))
+        self._make_room(self._count + len(points))
+        self._count = int(_insert(points, curve_order(points), self._vertices, self._triangles, self._count))
+
+    def _make_room(self, n: int) -> None:
+        """Make room for `n` vertices.
+
+        And for a quarter more: what is not touched takes no memory, and for what comes later the whole triangulation
+        need not be held twice.
+        """
+        if n <= len(self._vertices):
+            return
+        n += n // 4
+        vertices, triangles = np.empty((n, 3), dtype=np.int32), np.empty((2 * n - 6, 6), dtype=np.int32)
+        vertices[: self._count], triangles[: 2 * self._count - 6] = self.vertices, self.triangles
         self._vertices, self._triangles = vertices, triangles

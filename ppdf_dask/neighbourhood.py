@@ -15,8 +15,8 @@ from ppdf_dask.store import RunStore
 Int32 = npt.NDArray[np.int32]
 Bools = npt.NDArray[np.bool_]
 
-KEPT_POINTS = 3_000_000
-"""Points of neighbouring cores a task keeps decoded, those of the cloud it works on included (36 MB): the parts of a
+KEPT_POINTS = 2_000_000
+"""Points of neighbouring cores a task keeps decoded, those of the cloud it works on included (24 MB): the parts of a
 chunk ask for the same ones again, and beside a large cloud, decoding again takes next to no time."""
 
 
