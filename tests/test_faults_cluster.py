@@ -38,6 +38,14 @@ def expected(tiles, tmp_path_factory) -> dict[str, int]:
 STAGES = ("tile", "classify", "merge", "dtm", "cog")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def interruptible() -> Iterator[None]:
+    """A suite started in the background ignores SIGINT, and so would the commands it starts: no terminal does that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 class Command:
     """A `ppdf-dask` command in a process group of its own, as a terminal starts it."""
 
