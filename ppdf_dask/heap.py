@@ -18,7 +18,7 @@ def _trim() -> Callable[[int], int] | None:
 
 
 def give_back() -> None:
-    """Give all whole pages that hold nothing back; takes a few milliseconds.
+    """Give all whole pages that hold nothing back.
 
     Arrays below `MALLOC_MMAP_THRESHOLD_` (`ppdf_dask.cluster.ENVIRONMENT`) come from one heap, of which only the end
     shrinks by itself: a single small object that stays keeps all below it.

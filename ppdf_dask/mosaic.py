@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from rasterio.transform import Affine
 
+    from ppdf_dask.store import RunStore
+
 _UNITS = {1.0: "m", 0.3048: "ft", 1200 / 3937: "US_survey_foot"}
 """UDUNITS spellings."""
 
@@ -207,14 +209,14 @@ def write_cog(dtm: xr.DataArray, path: str | os.PathLike[str]) -> Path:
     return _write(_Picture((rows, columns), dtm.rio.crs, _transform(dtm), units, name, read), Path(path))
 
 
-def export_cog(store: str | os.PathLike[str], path: str | os.PathLike[str]) -> Path:
+def export_cog(store: RunStore, path: str | os.PathLike[str]) -> Path:
     """Write the heights of a run as `write_cog` does, byte for byte, without xarray.
 
     A worker that imports it, and Dask's arrays and pandas with it, is 80 MB larger from then on.
 
     Parameters
     ----------
-    store : path
+    store : RunStore
         The ``run.zarr`` of a run.
     path : path
         The file to write; an old one is replaced.
@@ -223,22 +225,24 @@ def export_cog(store: str | os.PathLike[str], path: str | os.PathLike[str]) -> P
     -------
     Path
         `path`.
+
+    Raises
+    ------
+    DamagedError
+        When an object of the raster is damaged.
     """
-    import zarr
     from rasterio.crs import CRS
 
-    array = zarr.open_array(Path(store) / "dtm" / "height", mode="r", zarr_format=3)
-    place = dict(zarr.open_array(Path(store) / "dtm" / "spatial_ref", mode="r", zarr_format=3).attrs)
+    shape, attributes = store.raster("height")
+    place = store.raster("spatial_ref")[1]
     wkt = place.get("crs_wkt")
 
     def read(r: int, c: int) -> npt.NDArray[np.float32]:
-        return np.asarray(array[r : r + BLOCK, c : c + BLOCK], dtype=np.float32)
+        return store.read_block("height", r // BLOCK, c // BLOCK, BLOCK)
 
-    rows, columns = array.shape
     crs = None if wkt is None else CRS.from_user_input(wkt)
     transform = _stored_transform(str(place["GeoTransform"]))
-    units = str(array.attrs.get("units", ""))
-    return _write(_Picture((rows, columns), crs, transform, units, "height", read), Path(path))
+    return _write(_Picture(shape, crs, transform, str(attributes.get("units", "")), "height", read), Path(path))
 
 
 def _write(picture: _Picture, path: Path) -> Path:

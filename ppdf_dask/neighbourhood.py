@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,27 @@ Bools = npt.NDArray[np.bool_]
 KEPT_POINTS = 2_000_000
 """Points of neighbouring cores a task keeps decoded, those of the cloud it works on included (24 MB): the parts of a
 chunk ask for the same ones again, and beside a large cloud, decoding again takes next to no time."""
+
+
+class Kept:
+    """Decoded points of chunks, at most `KEPT_POINTS` of them; the first that came go first."""
+
+    def __init__(self, read: Callable[[str], Int32]) -> None:
+        self._read = read
+        self._points: dict[str, Int32] = {}
+
+    def of(self, chunk: str) -> Int32:
+        """Return the points of a chunk."""
+        if chunk not in self._points:
+            found = self._read(chunk)
+            self.make_room(found.shape[1])
+            self._points[chunk] = found
+        return self._points[chunk]
+
+    def make_room(self, n: int) -> None:
+        """Let go of what leaves no room for `n` points more."""
+        while self._points and sum(p.shape[1] for p in self._points.values()) + n > KEPT_POINTS:
+            self._points.pop(next(iter(self._points)))
 
 
 @dataclass(frozen=True)
@@ -91,7 +113,7 @@ class Surroundings:
         self.counts = {source: points.shape[1] for source, points in cores.items()}
         self.core: Int32 = join(list(cores.values()))
         self._parts: dict[str, Parts] = {}
-        self._kept: dict[str, Int32] = {}
+        self._kept = Kept(lambda other: join(list(fragments(store, other, "core").values())))
 
     @property
     def n(self) -> int:
@@ -149,9 +171,9 @@ class Surroundings:
         else:
             for other in self._cut.grid.over(overlap(known, self._cut.extent)):
                 if other != self._chunk:
-                    pieces.append(crop(self._neighbour(other), other.core, home, known))
+                    pieces.append(crop(self._kept.of(other.id), other.core, home, known))
         points = join([p for p in pieces if p.shape[1]])
-        self._make_room(points.shape[1])
+        self._kept.make_room(points.shape[1])
         cloud = Cloud(
             x=points[0],
             y=points[1],
@@ -167,17 +189,6 @@ class Surroundings:
         if chunk not in self._parts:
             self._parts[chunk] = parts_of(self._store, chunk)
         return self._parts[chunk]
-
-    def _neighbour(self, chunk: Chunk) -> Int32:
-        if chunk.id not in self._kept:
-            found = join(list(fragments(self._store, chunk.id, "core").values()))
-            self._make_room(found.shape[1])
-            self._kept[chunk.id] = found
-        return self._kept[chunk.id]
-
-    def _make_room(self, n: int) -> None:
-        while self._kept and sum(p.shape[1] for p in self._kept.values()) + n > KEPT_POINTS:
-            self._kept.pop(next(iter(self._kept)))
 
 
 def unsure(cut: Cut, chunk: Chunk, near: Surroundings, reach: int) -> Bools:

@@ -113,7 +113,7 @@ class Plan:
     @cached_property
     def bytes_per_point(self) -> float:
         """Memory a task needs for each point it loads, in bytes: as read, as joined, and the filter's own."""
-        return _bytes_per_point(self.params, _density(self.survey, self.params))
+        return _bytes_per_point(self.params, self.density)
 
     @property
     def most_points(self) -> float:
@@ -140,9 +140,7 @@ class Plan:
     @cached_property
     def density(self) -> Density:
         """Expected density of the eligible points; the run itself counts it."""
-        points = sum(_eligible(t, self.params.returns == "last") for t in self.survey.tiles)
-        area = _area_mm2(self.survey) / MM**2
-        return Density(round(points), max(1, round(area / 25)))
+        return _density(self.survey, self.params)
 
     def check(self) -> None:
         """Refuse what cannot work.
@@ -300,10 +298,7 @@ def plan(
     params = params or RunParams()
     chosen = filters.of(params.filter)
     if params.chunks.buffer is None:
-        area = _area_mm2(survey) / MM**2
-        points = sum(_eligible(t, params.returns == "last") for t in survey.tiles)
-        estimate = Density(round(points), max(1, round(area / 25)))
-        buffer = chosen.required_buffer(chosen.resolve(params.filter, estimate))
+        buffer = chosen.required_buffer(chosen.resolve(params.filter, _density(survey, params)))
     else:
         buffer = params.chunks.buffer
         if not chosen.exact and buffer < chosen.required_buffer(params.filter):
@@ -319,15 +314,14 @@ def plan(
     return Plan(survey, params, Path(out).absolute(), grid, width, memory)
 
 
-def _bytes_per_point(params: RunParams, density: float) -> float:
+def _bytes_per_point(params: RunParams, density: Density) -> float:
     own = filters.of(params.filter).bytes_per_point
     return 24.0 + (own(params.filter, density) if callable(own) else own)
 
 
-def _density(survey: Survey, params: RunParams) -> float:
-    """Points a filter sees per square metre of all tiles."""
-    last = params.returns == "last"
-    return sum(_eligible(t, last) for t in survey.tiles) / max(_area_mm2(survey), 1) * MM**2
+def _density(survey: Survey, params: RunParams) -> Density:
+    points = sum(_eligible(t, params.returns == "last") for t in survey.tiles)
+    return Density(round(points), max(1, round(_area_mm2(survey) / MM**2 / 25)))
 
 
 def _eligible(tile: Tile, last: bool) -> float:

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ppdf_dask.dtm import BLOCK, Block, Part, Raster, rasterize_block
-from ppdf_dask.grid import MM, Chunk, Rect
+from ppdf_dask.grid import MM, Rect
 from ppdf_dask.index import owns_points
 from ppdf_dask.mosaic import raster_attributes, spatial_ref
-from ppdf_dask.neighbourhood import KEPT_POINTS, Cut
+from ppdf_dask.neighbourhood import Cut, Kept
 from ppdf_dask.params import DtmParams
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import Survey
@@ -97,26 +97,17 @@ def rasterize(store: RunStore, job: RasterJob, into: RunStore | None = None) -> 
 
 
 class _Ground:
-    """The ground points around a block, each chunk's decoded once as long as `KEPT_POINTS` allow."""
+    """The ground points around a block, each chunk's decoded once as long as `Kept` has room."""
 
     def __init__(self, store: RunStore, cut: Cut) -> None:
-        self._store, self._cut = store, cut
-        self._kept: dict[str, npt.NDArray[np.int32]] = {}
+        self._cut = cut
+        nothing = np.empty((3, 0), np.int32)
+        self._kept = Kept(lambda chunk: store.read_ground(chunk) if owns_points(store, chunk) else nothing)
 
     def around(self, rect: Rect) -> Iterator[Part]:
         """Yield the points of all chunks that share something with a rectangle."""
         for chunk in self._cut.grid.over(_clip(rect, self._cut.extent)):
-            yield Part(chunk.core.x0, chunk.core.y0, self._of(chunk))
-
-    def _of(self, chunk: Chunk) -> npt.NDArray[np.int32]:
-        if chunk.id not in self._kept:
-            found = np.empty((3, 0), np.int32)
-            if owns_points(self._store, chunk.id):
-                found = self._store.read_ground(chunk.id)
-            while self._kept and sum(p.shape[1] for p in self._kept.values()) + found.shape[1] > KEPT_POINTS:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[chunk.id] = found
-        return self._kept[chunk.id]
+            yield Part(chunk.core.x0, chunk.core.y0, self._kept.of(chunk.id))
 
 
 def checksum(layers: list[npt.NDArray[np.float32]]) -> int:

@@ -33,7 +33,7 @@ from ppdf_dask.raster import create
 from ppdf_dask.repair import heal, sweep, take_notes
 from ppdf_dask.repeats import shared_problems
 from ppdf_dask.saved import save_plan
-from ppdf_dask.stages import Cutting, Inputs, Records, Waiting, brief
+from ppdf_dask.stages import Cutting, Inputs, Records, Total, Waiting, brief
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiles import Problem, problem_dict, shown
 
@@ -217,7 +217,7 @@ class _Run:
         still_good: Callable[[str, dict[str, Any]], bool] = lambda ident, record: True,
     ) -> Records:
         """Do what the ledger does not hold yet; return of all records of the stage what is still asked of them."""
-        works, records, took = list(works), Records(), _Total()
+        works, records, took = list(works), Records(), Total()
         for ident, record in self.ledger.each_done(name, {w.ident: w.fingerprint for w in works}):
             if still_good(ident, record):
                 took.add(record)
@@ -384,26 +384,6 @@ def _check_targets(plan: Plan) -> None:
             raise SurveyError(f"{target.parent} leads out of {plan.out}, to {parent}; choose another --out")
         if os.path.realpath(tile.path) == os.path.join(parent, target.name):
             raise SurveyError(f"{target} is an input; inputs are never written to: choose another --out")
-
-
-@dataclass
-class _Total:
-    """What a stage took, summed up as its records come."""
-
-    tasks: int = 0
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    peak_mb: float = 0.0
-
-    def add(self, record: dict[str, Any]) -> None:
-        self.tasks += 1
-        self.seconds += record["seconds"]
-        self.cpu_seconds += record["cpu_seconds"]
-        self.peak_mb = max(self.peak_mb, record["peak_mb"])
-
-    def as_dict(self) -> dict[str, Any]:
-        seconds, cpu = round(self.seconds, 3), round(self.cpu_seconds, 3)
-        return {"tasks": self.tasks, "seconds": seconds, "cpu_seconds": cpu, "peak_mb": self.peak_mb}
 
 
 def _same_size(path: Path, record: dict[str, Any]) -> bool:

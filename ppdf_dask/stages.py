@@ -51,6 +51,28 @@ def brief(stage: str, record: dict[str, Any]) -> dict[str, Any]:
     return record if kept is None else {name: record[name] for name in kept if name in record}
 
 
+@dataclass
+class Total:
+    """What a stage took, summed up as its records come."""
+
+    tasks: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    peak_mb: float = 0.0
+
+    def add(self, record: dict[str, Any]) -> None:
+        """Count a record."""
+        self.tasks += 1
+        self.seconds += record["seconds"]
+        self.cpu_seconds += record["cpu_seconds"]
+        self.peak_mb = max(self.peak_mb, record["peak_mb"])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types."""
+        seconds, cpu = round(self.seconds, 3), round(self.cpu_seconds, 3)
+        return {"tasks": self.tasks, "seconds": seconds, "cpu_seconds": cpu, "peak_mb": self.peak_mb}
+
+
 @dataclass(frozen=True, slots=True)
 class Waiting:
     """A piece of work that cannot be done because another one failed."""

@@ -253,6 +253,11 @@ class RunStore(ObjectStore):
         array[...] = values
         self.put(key, objects[f"dtm/{name}/c/0/0"].to_bytes())
 
+    def raster(self, name: str) -> tuple[tuple[int, int], dict[str, Any]]:
+        """Return shape and attributes of a raster, or of its ``spatial_ref``."""
+        array = self._array(f"dtm/{name}")
+        return array.shape, dict(array.attrs)
+
     def read_block(self, name: str, row: int, column: int, size: int) -> npt.NDArray[np.float32]:
         """Read one whole shard of a raster; NaN where none was written.
 

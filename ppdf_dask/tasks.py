@@ -150,7 +150,7 @@ def export(url: str, target: str, fingerprint: str) -> dict[str, Any]:
     """Export the terrain model as a Cloud-Optimized GeoTIFF."""
     clock, store = _Clock(), RunStore(url)
     path = Path(target)
-    export_cog(url, path)
+    export_cog(store, path)
     record = {"status": "done", "bytes": path.stat().st_size, "crc32": crc32_of(path), **clock.stamp()}
     Ledger(store).publish("cog", path.name, fingerprint, record)
     return record

@@ -109,7 +109,7 @@ def test_the_same_raster_gives_the_same_bytes(tmp_path):
 def test_the_export_of_a_run_is_the_same_file(tmp_path, crs, unit):
     path, _, _ = stored(tmp_path, crs=crs, unit=unit)
     a = write_cog(open_dtm(path), tmp_path / "a.tif").read_bytes()
-    assert export_cog(path, tmp_path / "b.tif").read_bytes() == a
+    assert export_cog(RunStore(str(path)), tmp_path / "b.tif").read_bytes() == a
 
 
 def test_the_export_of_a_run_does_not_load_xarray(tmp_path):

@@ -315,4 +315,4 @@ def test_the_planner_knows_the_memory_of_the_filter(per_m2, n):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert callable(ppdf.bytes_per_point)
-    assert peak / n == pytest.approx(ppdf.bytes_per_point(params, per_m2), rel=0.25)
+    assert peak / n == pytest.approx(ppdf.bytes_per_point(params, Density(round(1000 * per_m2), 40)), rel=0.25)

@@ -46,7 +46,7 @@ class Filter:
         ``resolve(params, density) -> Parameters``: makes what is derived from the job-wide density explicit.
     bytes_per_point : float or callable
         Peak memory per loaded point above the 12 bytes of the points themselves, for the planner; where it depends on
-        the profile or the points per square metre, ``bytes_per_point(params, density) -> float``.
+        the profile or the density, ``bytes_per_point(params, density) -> float``.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Filter:
     required_buffer: Callable[[Parameters], float]
     exact: bool
     resolve: Callable[[Parameters, Density], Parameters]
-    bytes_per_point: float | Callable[[Parameters, float], float]
+    bytes_per_point: float | Callable[[Parameters, Density], float]
 
 
 @cache

@@ -37,12 +37,13 @@ def _resolve(params: Parameters, density: Density) -> Parameters:
     return params.resolve(density) if isinstance(params, RobustParams) else params
 
 
-def _bytes_per_point(params: Parameters, density: float) -> float:
+def _bytes_per_point(params: Parameters, density: Density) -> float:
     """Return what was measured: the robust profile has 30 bytes for a point and 50 for a cell, 180 with halved ones."""
     if not isinstance(params, RobustParams):
         return 90.0
-    resolved = params.resolve(Density(max(1, round(density * 25_000)), 1000))
-    return 30.0 + (180.0 if resolved.refinement == 2 else 50.0) / (max(density, 0.04) * (resolved.cell_mm / MM) ** 2)
+    resolved = params.resolve(density)
+    points_in_cell = max(density.per_m2, 0.04) * (resolved.cell_mm / MM) ** 2
+    return 30.0 + (180.0 if resolved.refinement == 2 else 50.0) / points_in_cell
 
 
 FILTER = Filter(

@@ -45,7 +45,7 @@ def kernel(function: F) -> F:
 def leaf(function: F) -> F:
     """Mark a function as compiled where a kernel calls it; it creates no array, and called from Python it is Python.
 
-    Nothing is compiled for callers it does not have: a quarter of the time that compiling takes.
+    Nothing is compiled for callers it does not have.
 
     Parameters
     ----------

@@ -49,6 +49,25 @@ def _fit(xs: Any, ys: Any, zs: Any, n: Any, seed: Any, trials: Any, t_in: Any, b
     return best_score > -(1 << 30)
 
 
+@leaf
+def _low_points(
+    c0: Any, r0: Any, size: Any, width: Any, cell: Any, pos: Any, state: Any, xs: Any, ys: Any, zs: Any, who: Any
+) -> Any:
+    """Take the low points of a square, metres from its corner and the first of them; return how many, and its z."""
+    n = base = np.int64(0)
+    for r in range(r0, r0 + size):
+        for k in range(r * width + c0, r * width + c0 + size):
+            if state[k] & LOW:
+                if n == 0:
+                    base = np.int64(pos[k, 2])
+                xs[n] = (pos[k, 0] - c0 * cell) * 1e-3
+                ys[n] = (pos[k, 1] - r0 * cell) * 1e-3
+                zs[n] = (pos[k, 2] - base) * 1e-3
+                who[n] = k
+                n += 1
+    return n, base
+
+
 class Patches(NamedTuple):
     """The planes found and the low points that lie in them, their seeds.
 
@@ -142,17 +161,7 @@ def _find_planes(
         while top:
             top -= 1
             c0, r0, size = stack[top, 0], stack[top, 1], stack[top, 2]
-            n = base = np.int64(0)
-            for r in range(r0, r0 + size):
-                for k in range(r * width + c0, r * width + c0 + size):
-                    if state[k] & LOW:
-                        if n == 0:
-                            base = np.int64(pos[k, 2])
-                        xs[n] = (pos[k, 0] - c0 * cell) * 1e-3
-                        ys[n] = (pos[k, 1] - r0 * cell) * 1e-3
-                        zs[n] = (pos[k, 2] - base) * 1e-3
-                        who[n] = k
-                        n += 1
+            n, base = _low_points(c0, r0, size, width, cell, pos, state, xs, ys, zs, who)
             if n < 4:
                 continue
             split = True
