@@ -57,8 +57,9 @@ def cut_again(store: RunStore, cutting: Cutting) -> bool:
     if not are_dropped(store):
         return False
     if kept_density(store, cutting.tiles) is not None:
-        wanted = {work.ident: work.fingerprint for work in cutting.classify_works()}
-        if len(Ledger(store).done("classify", wanted)) == len(wanted):
+        works = cutting.classify_works()
+        done = Ledger(store).each_done("classify", ((work.ident, work.fingerprint) for work in works))
+        if sum(1 for _ in done) == len(works):
             return False
     store.drop("ledger/tile")
     store.drop_record("dropped", "points")

@@ -81,11 +81,34 @@ class Chunk:
     @property
     def id(self) -> str:
         """A name that sorts and names a place: ``c_0500_5400``; an ``m`` marks a negative index."""
-        return f"c_{_label(self.ix)}_{_label(self.iy)}"
+        return chunk_id(self.ix, self.iy)
+
+
+def chunk_id(ix: int, iy: int) -> str:
+    """Return the id of the chunk of column `ix` and row `iy`."""
+    return f"c_{_label(ix)}_{_label(iy)}"
 
 
 def _label(i: int) -> str:
     return f"{i:04d}" if i >= 0 else f"m{-i:04d}"
+
+
+def parse_id(chunk: str) -> tuple[int, int]:
+    """Return column and row of the chunk with this id.
+
+    Examples
+    --------
+    >>> parse_id(chunk_id(12, -34))
+    (12, -34)
+    """
+    try:
+        kind, a, b = chunk.split("_")
+        if kind != "c":
+            raise ValueError(kind)
+        ix, iy = (-int(t[1:]) if t.startswith("m") else int(t) for t in (a, b))
+    except ValueError:
+        raise ParameterError(f"{chunk!r} is not a chunk id; one looks like c_0012_0034") from None
+    return ix, iy
 
 
 @dataclass(frozen=True)
@@ -119,14 +142,9 @@ class ChunkGrid:
         """Return the one chunk that owns the place (`x`, `y`), mm."""
         return self.chunk(x // self.size, y // self.size)
 
-    def parse(self, chunk_id: str) -> Chunk:
+    def parse(self, chunk: str) -> Chunk:
         """Return the chunk with this id."""
-        try:
-            _, a, b = chunk_id.split("_")
-            ix, iy = (-int(t[1:]) if t.startswith("m") else int(t) for t in (a, b))
-        except ValueError:
-            raise ParameterError(f"{chunk_id!r} is not a chunk id; one looks like c_0012_0034") from None
-        return self.chunk(ix, iy)
+        return self.chunk(*parse_id(chunk))
 
     def over(self, rect: Rect) -> Iterator[Chunk]:
         """Yield the chunks that share a point with `rect`, ordered by column and row."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -112,11 +112,11 @@ class Ledger:
         wanted : dict
             Id to the fingerprint its record must carry.
         """
-        return dict(self.each_done(stage, wanted))
+        return dict(self.each_done(stage, wanted.items()))
 
-    def each_done(self, stage: Stage, wanted: dict[str, str]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield id and record of what `done` returns, one by one."""
-        for ident, fingerprint in wanted.items():
+    def each_done(self, stage: Stage, wanted: Iterable[tuple[str, str]]) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield id and record of what `done` returns, one by one, for pairs of id and fingerprint."""
+        for ident, fingerprint in wanted:
             record = self.store.get_record(stage, ident)
             if record is not None and record.get("fingerprint") == fingerprint:
                 yield ident, lean(record)

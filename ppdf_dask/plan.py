@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from ppdf_dask import filters
 from ppdf_dask.classes import check_writable
 from ppdf_dask.errors import PlanError
+from ppdf_dask.estimate import ChunkEstimates, eligible, estimate
 from ppdf_dask.filters.cloud import Density
-from ppdf_dask.grid import MM, ChunkGrid, Rect
+from ppdf_dask.grid import MM, ChunkGrid
 from ppdf_dask.params import RunParams
 from ppdf_dask.survey import Survey, Tile
 from ppdf_dask.tiles import shown
@@ -52,27 +53,6 @@ MANY_BUFFERS = 4
 """A chunk is at least so many buffers wide where memory allows: then buffers are at most 5/4 of the core's points."""
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkEstimate:
-    """What the headers let expect of one chunk; its place is worked out when asked for, a plan may have a million."""
-
-    grid: ChunkGrid
-    ix: int
-    iy: int
-    points: float
-    loaded: float
-
-    @property
-    def id(self) -> str:
-        """The chunk's id."""
-        return self.grid.chunk(self.ix, self.iy).id
-
-    @property
-    def core(self) -> Rect:
-        """The chunk's core."""
-        return self.grid.chunk(self.ix, self.iy).core
-
-
 @dataclass(frozen=True)
 class Plan:
     """What a run will do and take; `run` does it.
@@ -106,9 +86,9 @@ class Plan:
         return self.buffer if self.buffer <= self.grid.size else 0
 
     @cached_property
-    def chunks(self) -> list[ChunkEstimate]:
+    def chunks(self) -> ChunkEstimates:
         """The chunks, densest first, with their expected numbers of eligible points."""
-        return _estimate(self.survey, self.grid, self.buffer, self.params.returns == "last")
+        return estimate(self.survey, self.grid, self.buffer, self.params.returns == "last")
 
     @cached_property
     def bytes_per_point(self) -> float:
@@ -123,13 +103,13 @@ class Plan:
     @property
     def task_mb(self) -> float:
         """Expected peak of the largest task, MB, the worker itself included."""
-        loaded = max((c.loaded for c in self.chunks), default=0.0)
+        loaded = float(self.chunks.loaded.max(initial=0.0))
         return WORKER_MB + max(loaded * self.bytes_per_point, BATCH_POINTS * TILE_BYTES) / 1e6
 
     @property
     def disk_mb(self) -> dict[str, float]:
         """Expected size of the store, the LAZ files and the raster, MB."""
-        stored = sum(c.points * _share(self.grid.size, self.stored_buffer) for c in self.chunks) * STORED_BYTES
+        stored = float(self.chunks.points.sum()) * _share(self.grid.size, self.stored_buffer) * STORED_BYTES
         pixels = _area_mm2(self.survey) / (self.params.dtm.resolution * MM) ** 2
         return {
             "run.zarr": round((stored + pixels * 5) / 1e6, 1),
@@ -233,8 +213,8 @@ class Plan:
             "chunks": len(self.chunks),
             "chunk_size_m": self.grid.size / MM,
             "buffer_m": self.buffer / MM,
-            "points_per_chunk_max": round(max((c.points for c in self.chunks), default=0)),
-            "points_loaded_max": round(max((c.loaded for c in self.chunks), default=0)),
+            "points_per_chunk_max": round(self.chunks.points.max(initial=0.0)),
+            "points_loaded_max": round(self.chunks.loaded.max(initial=0.0)),
             "density_per_m2": round(self.density.per_m2, 3),
             "task_mb": round(self.task_mb),
             "disk_mb": self.disk_mb,
@@ -320,14 +300,8 @@ def _bytes_per_point(params: RunParams, density: Density) -> float:
 
 
 def _density(survey: Survey, params: RunParams) -> Density:
-    points = sum(_eligible(t, params.returns == "last") for t in survey.tiles)
+    points = sum(eligible(t, params.returns == "last") for t in survey.tiles)
     return Density(round(points), max(1, round(_area_mm2(survey) / MM**2 / 25)))
-
-
-def _eligible(tile: Tile, last: bool) -> float:
-    """Points a tile offers: last and only returns are as many as the pulses, which the header counts."""
-    pulses = tile.first_returns
-    return float(pulses if last and 0 < pulses < tile.point_count else tile.point_count)
 
 
 def _extent(tile: Tile) -> int:
@@ -342,27 +316,6 @@ def _share(size: int, buffer: int) -> float:
     return ((size + 2 * buffer) / size) ** 2
 
 
-def _estimate(survey: Survey, grid: ChunkGrid, buffer: int, last: bool) -> list[ChunkEstimate]:
-    """Spread each tile's points evenly over its bounds, and again over the bounds grown by the buffer."""
-    points: dict[tuple[int, int], float] = {}
-    loaded: dict[tuple[int, int], float] = {}
-    for tile in survey.tiles:
-        b = tile.bounds
-        per_area = _eligible(tile, last) / max(b.width * b.height, 1)
-        for chunk in grid.over(b.grow(buffer)):
-            key = (chunk.ix, chunk.iy)
-            inside = _area(b, chunk.core)
-            if inside:
-                points[key] = points.get(key, 0.0) + per_area * inside
-            loaded[key] = loaded.get(key, 0.0) + per_area * _area(b, chunk.core.grow(buffer))
-    found = [ChunkEstimate(grid, *key, n, loaded[key]) for key, n in sorted(points.items())]
-    return sorted(found, key=lambda c: (-c.loaded, c.id))
-
-
-def _area(a: Rect, b: Rect) -> int:
-    return max(0, min(a.x1, b.x1) - max(a.x0, b.x0)) * max(0, min(a.y1, b.y1) - max(a.y0, b.y0))
-
-
 def _choose(survey: Survey, params: RunParams, buffer: int, memory: float) -> ChunkGrid:
     """Take the largest edge whose densest chunk fits the memory and has points enough, but not more.
 
@@ -370,8 +323,8 @@ def _choose(survey: Survey, params: RunParams, buffer: int, memory: float) -> Ch
     """
     fits = (0.6 * memory - WORKER_MB * 1e6) / _bytes_per_point(params, _density(survey, params))
     last = params.returns == "last"
-    total = sum(_eligible(t, last) for t in survey.tiles)
-    densest = max((_eligible(t, last) / max(_extent(t), 1) for t in survey.tiles), default=0.0)
+    total = sum(eligible(t, last) for t in survey.tiles)
+    densest = max((eligible(t, last) / max(_extent(t), 1) for t in survey.tiles), default=0.0)
     enough = max(min(max(total / 3, FEW_POINTS), MOST_POINTS), densest * (MANY_BUFFERS * buffer) ** 2)
     chosen = CHUNK_SIZES[0]
     for size in CHUNK_SIZES:

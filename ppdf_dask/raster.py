@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,21 +53,21 @@ def create(store: RunStore, raster: Raster, params: DtmParams, survey: Survey) -
     )
 
 
-def jobs(raster: Raster, ground: dict[Rect, int], params: DtmParams) -> Iterator[tuple[Block, int]]:
+def jobs(raster: Raster, ground: Iterable[tuple[Rect, int]], params: DtmParams) -> Iterator[tuple[Block, int]]:
     """Yield the blocks that can hold a height, with the ground points they stand for, most first.
 
     Parameters
     ----------
     raster : Raster
         The run's raster.
-    ground : dict
-        Ground points of each chunk's core.
+    ground : iterable of (Rect, int)
+        The chunks' cores and their ground points.
     params : DtmParams
         A triangle reaches `max_edge` (`fill_edge`) beyond its points at most.
     """
     reach = round(max(params.max_edge, params.fill_edge or 0.0) * MM)
     points: dict[Block, float] = {}
-    for core, count in ground.items():
+    for core, count in ground:
         for block in raster.grid.over(_clip(core.grow(reach), raster.rect)):
             shared = _clip(core, block.rect)
             share = max(0, shared.width) * max(0, shared.height) / (core.width * core.height)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -33,7 +33,7 @@ from ppdf_dask.raster import create
 from ppdf_dask.repair import heal, sweep, take_notes
 from ppdf_dask.repeats import shared_problems
 from ppdf_dask.saved import save_plan
-from ppdf_dask.stages import Cutting, Inputs, Records, Total, Waiting, brief
+from ppdf_dask.stages import ChunkFacts, Cutting, Inputs, Kept, Records, Total, Waiting, brief
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiles import Problem, problem_dict, shown
 
@@ -103,7 +103,7 @@ class _Run:
     waiting: list[Waiting] = field(default_factory=list)
     damaged: list[str] = field(default_factory=list)
     totals: dict[str, dict[str, Any]] = field(default_factory=dict)
-    chunks: Records = field(default_factory=dict)
+    chunks: ChunkFacts = field(default_factory=dict)
     merged: Records = field(default_factory=dict)
     blocks: Records = field(default_factory=dict)
     odd: list[Problem] = field(default_factory=list)
@@ -146,7 +146,7 @@ class _Run:
 
     def tile(self) -> None:
         """Cut the source files; afterwards a place without fragments is known to be empty."""
-        self.tiles = self._stage("tile", tasks.tile, self.inputs.tile_works())
+        self.tiles = self._stage("tile", tasks.tile, self.inputs.tile_works(), Records())
         sources, unit = self.inputs.sources, self.plan.survey.unit_xy
         self.odd = []
         self._note("tile", [p for s, record in self.tiles.items() for p in oddities(sources[s], record, unit)])
@@ -166,7 +166,11 @@ class _Run:
         """Classify the chunks, densest first."""
         works = self.cutting.classify_works()
         self.chunks = self._stage(
-            "classify", tasks.classify, works, lambda _, record: self.cutting.still_proven(record)
+            "classify",
+            tasks.classify,
+            works,
+            self.cutting.chunk_records(),
+            lambda _, record: self.cutting.still_proven(record),
         )
         looked_at = {source: record["eligible"] for source, record in self.tiles.items()}
         found = shared_problems(self.inputs.sources, looked_at, (r["shared"] for r in self.chunks.values()))
@@ -180,6 +184,7 @@ class _Run:
             "merge",
             tasks.merge,
             works,
+            Records(),
             lambda ident, record: _same_size(Path(self.cutting.target(ident)), record),
         )
         for source in self.inputs.sources.keys() - self.merged.keys():
@@ -195,14 +200,16 @@ class _Run:
             create(self.store, self.cutting.raster, p.params.dtm, p.survey)
             self.store.put_record("raster", "layout", {"fingerprint": key})
         works, waiting = self.cutting.dtm_works(self.chunks)
-        self.blocks = self._stage("dtm", tasks.rasterize, works)
+        self.blocks = self._stage("dtm", tasks.rasterize, works, Records())
         failed = [Waiting("dtm", w.ident, "it failed") for w in works if w.ident not in self.blocks]
         done = [w for w in works if w.ident in self.blocks]
         self.waiting += waiting
         if self.damaged:
             return
         export = self.cutting.cog_work(done, waiting + failed)
-        exported = self._stage("cog", tasks.export, [export], lambda name, record: _same_size(p.out / name, record))
+        exported = self._stage(
+            "cog", tasks.export, [export], Records(), lambda name, record: _same_size(p.out / name, record)
+        )
         for name in {"dtm.tif", "dtm.partial.tif"} - exported.keys():
             whole = self.cutting.cog_work(works, []).fingerprint
             self._remove_outdated("cog", name, whole if name == "dtm.tif" else "", p.out / name)
@@ -213,16 +220,16 @@ class _Run:
         self,
         name: StageName,
         function: Any,
-        works: Iterable[Work],
+        works: Collection[Work],
+        records: Kept,
         still_good: Callable[[str, dict[str, Any]], bool] = lambda ident, record: True,
-    ) -> Records:
-        """Do what the ledger does not hold yet; return of all records of the stage what is still asked of them."""
-        works, records, took = list(works), Records(), Total()
-        for ident, record in self.ledger.each_done(name, {w.ident: w.fingerprint for w in works}):
+    ) -> Kept:
+        """Do what the ledger does not hold yet; put of all records of the stage what is still asked of them."""
+        took = Total()
+        for ident, record in self.ledger.each_done(name, ((w.ident, w.fingerprint) for w in works)):
             if still_good(ident, record):
                 took.add(record)
                 records[ident] = brief(name, record)
-        todo = [w for w in works if w.ident not in records and (name, w.ident) not in self.failures]
         total = sum(w.points for w in works)
         resumed = sum(w.points for w in works if w.ident in records)
         self.on_event(
@@ -234,7 +241,9 @@ class _Run:
                 record={"tasks": len(works), "done": len(records), "resumed": sorted(records)},
             )
         )
-        if todo:
+        # The records grow while it is gone through, but only by pieces that it gave already.
+        todo = (w for w in works if w.ident not in records and (name, w.ident) not in self.failures)
+        if len(records) < len(works):
             (self.plan.out / "run.json").unlink(missing_ok=True)
         stage = Stage(name, function, self.store.url, digest([self.store.url, os.getpid()])[:8])
         for item, outcome in execute(self.client, stage, todo, self.on_event, self.check):
@@ -353,7 +362,7 @@ class _Run:
         what = "" if tile is None else shown(tile.path)
         if failure.stage == "classify":
             box = self.plan.grid.parse(failure.ident).core
-            sources = {s for part in self.cutting.index.chunks[failure.ident].values() for s in part}
+            sources = {s for part in self.cutting.index.parts(failure.ident).values() for s in part}
             files = [self.inputs.sources[s].path for s in sorted(sources)]
             need = self.cutting.need_mb(failure.ident)
             what = f"needs about {need:.0f} MB, a worker has {self.plan.memory / 1e6:.0f} MB"

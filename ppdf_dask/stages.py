@@ -7,18 +7,24 @@ Pure bookkeeping over the plan and the ledger's records: nothing here runs anyth
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from itertools import chain
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from ppdf_dask import __version__, filters
+from ppdf_dask.chunktable import ChunkRecords, chunk_at
 from ppdf_dask.codeprint import code
 from ppdf_dask.dropped import are_dropped, kept_density
 from ppdf_dask.dtm import Block, DtmGrid, Raster
 from ppdf_dask.execute import Work
 from ppdf_dask.filters.cloud import Density
 from ppdf_dask.grid import MM, Rect
-from ppdf_dask.index import Index
+from ppdf_dask.index import Index, packed
 from ppdf_dask.ledger import digest
 from ppdf_dask.merge import MergeJob
 from ppdf_dask.neighbourhood import Cut
@@ -32,8 +38,19 @@ from ppdf_dask.tiler import TileJob, unpack_cells
 
 Records = dict[str, dict[str, Any]]
 
-KEPT = {"classify": ("ground", "unproven", "repeated", "shared"), "merge": ("points",), "dtm": ()}
-"""What a driver keeps of the records of the stages with most pieces, until the end of a run."""
+Kept = TypeVar("Kept", Records, ChunkRecords)
+"""Where the records of a stage are kept."""
+
+ChunkFacts = Mapping[str, Mapping[str, Any]]
+"""What is known of the chunks that are classified, by id; of each its number of ground points at least."""
+
+KEPT = {
+    "tile": ("fingerprint", "bounds", "eligible", "no_returns", "odd_returns", "chunks", "labels"),
+    "classify": ("ground", "unproven", "repeated", "shared"),
+    "merge": ("points",),
+    "dtm": (),
+}
+"""What a driver keeps of the records of the stages with many pieces, until the end of a run."""
 
 SMALL = 2_000_000.0
 """Points of a cloud that take so little memory that cutting it for that would be a waste of time."""
@@ -48,7 +65,8 @@ def brief(stage: str, record: dict[str, Any]) -> dict[str, Any]:
     {'points': 3}
     """
     kept = KEPT.get(stage)
-    return record if kept is None else {name: record[name] for name in kept if name in record}
+    found = record if kept is None else {name: record[name] for name in kept if name in record}
+    return found | {"chunks": packed(found["chunks"])} if stage == "tile" else found
 
 
 @dataclass
@@ -80,6 +98,30 @@ class Waiting:
     stage: str
     ident: str
     because: str
+
+
+class Works(Collection[Work]):
+    """Pieces of work that are made whenever they are looked at, for the stage that has a piece for each chunk.
+
+    Parameters
+    ----------
+    items : ndarray of int64
+        One number for each, in the order of the work.
+    make : callable
+        Makes the piece of a number.
+    """
+
+    def __init__(self, items: npt.NDArray[np.int64], make: Callable[[int], Work]) -> None:
+        self._items, self._make = items, make
+
+    def __iter__(self) -> Iterator[Work]:
+        return (self._make(int(item)) for item in self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __contains__(self, work: object) -> bool:
+        return any(work == other for other in self)
 
 
 @dataclass(frozen=True)
@@ -190,20 +232,14 @@ class Cutting:
         kept = kept_density(self.store, self.tiles)
         if kept is not None:
             return kept
-        cells = 0
-        for chunk, parts in self.index.chunks.items():
-            sources = list(parts["core"])
-            if len(sources) == 1:
-                cells += self.tiles[sources[0]]["chunks"][chunk][1]
-            elif sources:
-                bits = [
-                    unpack_cells(self.store.fragment_attributes(chunk, "core", s)["density_cells"]) for s in sources
-                ]
-                united = bits[0].copy()
-                for other in bits[1:]:
-                    united |= other
-                cells += int.from_bytes(united.tobytes(), "big").bit_count()
-        return Density(sum(self.index.points.values()), cells)
+        cells, shared = self.index.cells()
+        for chunk, sources in shared:
+            bits = [unpack_cells(self.store.fragment_attributes(chunk, "core", s)["density_cells"]) for s in sources]
+            united = bits[0].copy()
+            for other in bits[1:]:
+                united |= other
+            cells += int.from_bytes(united.tobytes(), "big").bit_count()
+        return Density(int(self.index.points.counts.sum()), cells)
 
     @cached_property
     def filter(self) -> Parameters:
@@ -257,13 +293,23 @@ class Cutting:
     @cached_property
     def usual_points(self) -> float:
         """Points above which a cloud with a wider buffer is cut: those of the largest first one."""
-        return max([SMALL, *map(self.index.loaded, self.index.chunks)])
+        return float(self.index.loaded.counts.max(initial=round(SMALL)))
 
-    def classify_works(self) -> list[Work]:
+    def classify_works(self) -> Works:
         """Return the work of the classify stage, densest chunk first."""
-        chunks = sorted(self.index.points.items(), key=lambda item: (-item[1], item[0]))
+        chunks = self.index.points
         key, make = self.classify_key, self.classify_job
-        return [Work(chunk, n, chunk, key, make) for chunk, n in chunks]
+
+        def work(row: int) -> Work:
+            chunk = chunk_at(int(chunks.places[row]))
+            return Work(chunk, int(chunks.counts[row]), chunk, key, make)
+
+        return Works(np.argsort(-chunks.counts, kind="stable"), work)
+
+    def chunk_records(self) -> ChunkRecords:
+        """Return room for what is kept of the records of the classify stage."""
+        *numbers, shared = KEPT["classify"]
+        return ChunkRecords(self.index.points, tuple(numbers), shared)
 
     def still_proven(self, record: dict[str, Any]) -> bool:
         """Tell whether a chunk's record is the best that can be had: proven, or as wide as is allowed."""
@@ -272,7 +318,7 @@ class Cutting:
 
     def need_mb(self, chunk: str) -> float:
         """Return the memory a worker needs for a chunk with its first buffer, MB."""
-        return round(WORKER_MB + self.index.loaded(chunk) * self.inputs.plan.bytes_per_point / 1e6)
+        return round(WORKER_MB + self.index.loaded[chunk] * self.inputs.plan.bytes_per_point / 1e6)
 
     # -- merge ----------------------------------------------------------------------------------------------------
 
@@ -284,20 +330,27 @@ class Cutting:
         """Return the path of a classified tile."""
         return str(self.inputs.plan.out / "laz" / self.inputs.sources[source].name)
 
-    def merge_works(self, chunks: Records) -> tuple[list[Work], list[Waiting]]:
+    def merge_works(self, chunks: ChunkFacts) -> tuple[list[Work], list[Waiting]]:
         """Return the tiles whose chunks are all classified, largest first, and those that wait."""
         works: list[Work] = []
         waiting: list[Waiting] = []
         make = partial(self._merge_job, dropped=are_dropped(self.store))
+        missing: dict[str, str] = {}
+        for chunk in self._lost(chunks):
+            for source in self.index.parts(chunk)["core"]:
+                missing.setdefault(source, chunk)
         for source, tile in self.inputs.sources.items():
             if source not in self.tiles:
                 continue
-            missing = [c for c, (core, _, _) in self.tiles[source]["chunks"].items() if core and c not in chunks]
-            if missing:
-                waiting.append(Waiting("merge", source, f"chunk {missing[0]} is not classified"))
+            if source in missing:
+                waiting.append(Waiting("merge", source, f"chunk {missing[source]} is not classified"))
                 continue
             works.append(Work(source, tile.point_count, source, self.merge_key(source), make))
         return sorted(works, key=lambda w: (-w.points, w.ident)), waiting
+
+    def _lost(self, chunks: ChunkFacts) -> Iterator[str]:
+        """Yield the chunks that are not classified."""
+        return (chunk for chunk in self.index.points if chunk not in chunks)
 
     def _merge_job(self, source: str, *, dropped: bool) -> MergeJob:
         labels = 0 if dropped else self.index.labels[source]
@@ -317,19 +370,18 @@ class Cutting:
         p = self.inputs.plan
         return digest([self.classify_key, p.params.dtm.as_dict(), p.survey.unit_z, p.survey.crs])
 
-    def dtm_works(self, chunks: Records) -> tuple[list[Work], list[Waiting]]:
+    def dtm_works(self, chunks: ChunkFacts) -> tuple[list[Work], list[Waiting]]:
         """Return the blocks all of whose surroundings are classified, fullest first, and those that wait."""
         p = self.inputs.plan
-        lost = {p.grid.parse(c).core: n for c, n in self.index.points.items() if c not in chunks}
+        lost = {p.grid.parse(c).core: self.index.points[c] for c in self._lost(chunks)}
         lost |= dict.fromkeys(self.unknown, 1)
-        places = {p.grid.parse(c).core: r["ground"] for c, r in chunks.items() if r["ground"]}
+        ground = ((p.grid.parse(c).core, r["ground"]) for c, r in chunks.items() if r["ground"])
         # A block's proof reads ground up to two limits around it.
         reach = 2 * round(max(p.params.dtm.max_edge, p.params.dtm.fill_edge or 0.0) * MM)
         make = self._raster_job
         works: list[Work] = []
         waiting: list[Waiting] = []
-        places |= lost
-        for block, points in jobs(self.raster, places, p.params.dtm):
+        for block, points in jobs(self.raster, chain(ground, lost.items()), p.params.dtm):
             around = block.rect.grow(reach)
             if any(around.intersects(place) for place in lost):
                 waiting.append(Waiting("dtm", block.id, "ground around it is not known"))

@@ -154,14 +154,14 @@ class _Check:
         published = self.cutting.index.is_published(self.store)
         if not published:
             self.report.pending.append("index key")
-        for path, chunks in self.cutting.index.shards().items() if published else ():
+        for path, chunks in self.cutting.index.shards() if published else ():
             try:
                 shard = self.store.get_node(path)
             except DamagedError:
                 shard = None
             if shard is None or digest(shard.get("chunks")) != digest(chunks):
                 self._add("torn" if shard is None else "foreign", path, "is not what the tiles say")
-        for chunk, parts in self.cutting.index.chunks.items():
+        for chunk, parts in self.cutting.index.each():
             if self.dropped:
                 self.report.counts["eligible"] += sum(n for n, _ in parts["core"].values())
                 continue
@@ -186,7 +186,7 @@ class _Check:
             try:
                 masks = self.store.read_classification(chunk, record["fingerprint"])
                 ground = np.concatenate(list(masks.values()))
-                expected = {s: n for s, (n, _) in self.cutting.index.chunks[chunk]["core"].items()}
+                expected = {s: n for s, (n, _) in self.cutting.index.parts(chunk)["core"].items()}
                 if {s: len(m) for s, m in masks.items()} != expected or zlib.crc32(ground.tobytes()) != record["crc32"]:
                     self._add("foreign", f"classification/{chunk}", "is not what its record says")
                 self.report.counts["ground"] += int(ground.sum())

@@ -20,7 +20,7 @@ from ppdf_dask.grid import MM, Rect
 from ppdf_dask.ledger import Ledger
 from ppdf_dask.params import ChunkParams, DtmParams, RunParams
 from ppdf_dask.quarantine import Failure
-from ppdf_dask.stages import Cutting, Inputs, Records, brief
+from ppdf_dask.stages import Cutting, Inputs, Kept, Records, brief
 from ppdf_dask.store import RunStore
 from ppdf_dask.survey import Survey
 from ppdf_dask.tiles import Tile
@@ -154,14 +154,14 @@ def simulate(chunks: int, folder: Path, workers: int) -> Simulated:
         store = RunStore(str(out / "run.zarr"))
         store.create({})
         inputs = Inputs(made)
-        tiles = _stage(client, store, "tile", inputs.tile_works(), stages)
+        tiles = _stage(client, store, "tile", inputs.tile_works(), Records(), stages)
         begin = time.perf_counter()
         cutting = Cutting(inputs, store, tiles)
         cutting.index.publish(store)
         indexed = time.perf_counter() - begin
-        found = _stage(client, store, "classify", cutting.classify_works(), stages)
-        _stage(client, store, "merge", cutting.merge_works(found)[0], stages)
-        _stage(client, store, "dtm", cutting.dtm_works(found)[0], stages)
+        found = _stage(client, store, "classify", cutting.classify_works(), cutting.chunk_records(), stages)
+        _stage(client, store, "merge", cutting.merge_works(found)[0], Records(), stages)
+        _stage(client, store, "dtm", cutting.dtm_works(found)[0], Records(), stages)
     tasks = sum(int(s["tasks"]) for s in stages.values())
     if len(found) != expected:
         raise AssertionError(f"{expected} chunks were planned, {len(found)} done")
@@ -169,9 +169,14 @@ def simulate(chunks: int, folder: Path, workers: int) -> Simulated:
 
 
 def _stage(
-    client: Client, store: RunStore, name: str, works: Iterable[Work], stages: dict[str, dict[str, float]]
-) -> Records:
-    begin, records = time.perf_counter(), Records()
+    client: Client,
+    store: RunStore,
+    name: str,
+    works: Iterable[Work],
+    records: Kept,
+    stages: dict[str, dict[str, float]],
+) -> Kept:
+    begin = time.perf_counter()
     for work, outcome in execute(client, Stage(name, pretend, store.url, "pretended"), works, lambda event: None):
         if isinstance(outcome, Failure):
             raise AssertionError(outcome.detail)
@@ -194,6 +199,7 @@ def pretend(url: str, job: Any, fingerprint: str) -> dict[str, Any]:
         cores = {c.id: [PER_CHUNK, 2500, 0] for c in job.grid.over(box)}
         record = {"points": job.tile.point_count, "eligible": job.tile.point_count, "chunks": cores}
         record |= {"bounds": [box.x0, box.y0, box.x1, box.y1], "z": [0, 100_000], "classes": {}}
+        record |= {"no_returns": 0, "odd_returns": 0, "labels": 1}
         ledger.publish("tile", job.source, fingerprint, record | common)
     elif isinstance(job, MergeJob):
         record = {"points": job.tile.tile.point_count, "changed": 0, "classes": {}, "crc32": 0, "bytes": 1}
@@ -203,6 +209,6 @@ def pretend(url: str, job: Any, fingerprint: str) -> dict[str, Any]:
         ledger.publish("dtm", job.block.id, fingerprint, record | common)
     else:
         record = {"points": PER_CHUNK, "loaded": PER_CHUNK, "ground": PER_CHUNK // 2, "unproven": 0, "crc32": 0}
-        record |= {"buffer_m": 56.0, "tries": 1, "full": False}
+        record |= {"buffer_m": 56.0, "tries": 1, "full": False, "repeated": 0, "shared": {}}
         ledger.publish("classify", job.chunk.id, fingerprint, record | common)
     return {**record, **common, "fingerprint": fingerprint}
