@@ -18,6 +18,9 @@ _jitable: Any = register_jitable
 # of a neighbour search. Python holds the arrays anyway. Nobody calls the functions from C.
 _LEAN = {"_nrt": False, "no_cfunc_wrapper": True}
 
+# A signed index may count from the end, which numba looks at whenever one is used that is not a loop's own counter; the
+# hottest kernels use unsigned ones (`np.uintp`).
+
 
 def kernel(function: F) -> F:
     """Compile a function that Python calls; it creates no array, so a mistake shows at once.

@@ -69,7 +69,7 @@ def _locate(x: Any, y: Any, x0: Any, y0: Any, cell: Any, width: Any, of_point: A
 @kernel
 def _lowest(x: Any, y: Any, z: Any, fixed: Any, x0: Any, y0: Any, of_point: Any, pos: Any, state: Any) -> None:
     for i in range(len(x)):
-        k = of_point[i]
+        k = np.uintp(of_point[i])
         s = state[k]
         if s & UNPROVEN:
             continue

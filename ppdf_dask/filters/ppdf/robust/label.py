@@ -121,32 +121,32 @@ def _gather(
 ) -> Any:
     """Label the next points that need no surface, and put the others; return the point to go on with and how many."""
     x, y, z, fixed, x0, y0, of_point, floor, known, _rough = points
-    i, count = start, np.int64(0)
-    while i < n_core and count < BATCH:
-        big = of_point[i]
+    i, count = np.uintp(start), np.uintp(0)
+    while i < np.uintp(n_core) and count < np.uintp(BATCH):
+        big = np.uintp(of_point[i])
         pin = len(fixed) > 0 and fixed[i]
         ground[i] = pin
         unproven[i] = not pin and not known[big] & LOW and (known[big] & UNPROVEN) != 0
         if not pin and known[big] & LOW and z[i] > floor[big]:
             xi, yi, zi = np.int64(x[i]) - x0, np.int64(y[i]) - y0, np.int64(z[i])
             row, col = yi // cell, xi // cell
-            k = row * width + col
+            k = np.uintp(row * width + col)
             is_low = zi == pos[k, 2] and xi == pos[k, 0] and yi == pos[k, 1]
             ground[i] = is_low and (state[k] & REF) != 0
             unproven[i] = is_low and (state[k] & UNPROVEN) != 0
             only_cliff = is_low or zi - pos[k, 2] >= FAR_ABOVE or (state[k] & HIGH) != 0
             settled = False
             if only_cliff:
-                b = row // BLOCK * (width // BLOCK) + col // BLOCK
+                b = np.uintp(row // BLOCK * (width // BLOCK) + col // BLOCK)
                 settled = ground[i] or zi > tops[b, 0]
                 unproven[i] |= not settled and tops[b, 1] != 0
             if not settled:
                 place[count, X], place[count, Y], place[count, Z] = xi, yi, zi
                 place[count, FX], place[count, FY] = xi - col * cell, yi - row * cell
-                place[count, CELL], place[count, ASKED] = k, 2 * i + only_cliff
-                count += 1
-        i += 1
-    return i, count
+                place[count, CELL], place[count, ASKED] = k, 2 * np.int64(i) + only_cliff
+                count += np.uintp(1)
+        i += np.uintp(1)
+    return np.int64(i), np.int64(count)
 
 
 @kernel

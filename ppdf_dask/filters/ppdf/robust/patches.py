@@ -71,7 +71,7 @@ def link_patches(cells: Cells, patches: Patches) -> Components:
     """Unite the patches whose planes agree where they touch."""
     count = len(patches.planes)
     root, open_ = np.arange(count, dtype=np.int32), np.zeros(count, np.bool_)
-    votes, touched = np.zeros((count, 2), np.int64), np.empty(count, np.int64)
+    votes, touched = np.tile([0, 0, -1], (count, 1)), np.empty(count, np.int64)
     unknown = (cells.state & UNPROVEN != 0) | (patches.of_cell == NOT_KNOWN_PATCH)
     seen = np.where(unknown, UNKNOWN, patches.of_cell)
     _link_patches(
@@ -79,10 +79,11 @@ def link_patches(cells: Cells, patches: Patches) -> Components:
         cells.cell,
         cells.pos,
         seen,
+        _highest(seen),
         patches.planes,
         patches.squares,
-        NEAR,
-        AGREE,
+        np.full(len(seen), -1, np.int32),
+        np.empty((2 * NEAR + 1) ** 2 + 1, np.int64),
         votes,
         touched,
         root,
@@ -91,16 +92,29 @@ def link_patches(cells: Cells, patches: Patches) -> Components:
     return Components(root, open_)
 
 
+def _highest(values: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Return the greatest of each value and the `2 * NEAR` after it."""
+    count = len(values) - 2 * NEAR
+    found = values[:count].copy()
+    for step in range(1, 2 * NEAR + 1):
+        np.maximum(found, values[step : step + count], out=found)
+    return found
+
+
+PAIRS, AGREEING, ASKED = range(3)
+
+
 @kernel
 def _link_patches(
     width: Any,
     cell: Any,
     pos: Any,
     patch: Any,
+    highest: Any,
     planes: Any,
     squares: Any,
-    near: Any,
-    agree: Any,
+    agrees: Any,
+    around: Any,
     votes: Any,
     touched: Any,
     parent: Any,
@@ -108,8 +122,12 @@ def _link_patches(
 ) -> None:
     """Unite patches whose planes agree; mark in `open_` the patches that touch something unproven.
 
-    `patch` is `UNKNOWN` where a cell is unproven. `votes` (n, 2) is zero and `touched` room of one row for each patch;
-    `parent` of each patch is itself.
+    `patch` is `UNKNOWN` where a cell is unproven, `highest` the greatest of a cell and the `2 * NEAR` after it.
+    `parent` of each patch is itself. Room: `votes` (n, 3) of zeros and -1, `touched` (n), `agrees` of -1 for each cell,
+    `around` for the cells around one and a cell more.
+
+    Both a patch's votes and the cells remember what was answered last, for twice the number of who asked: a low point
+    is compared once with each plane, not once for each pair.
     """
     for p in range(len(parent)):
         n = 0
@@ -118,29 +136,35 @@ def _link_patches(
             for k in range(r * width + c0, r * width + c0 + size):
                 if patch[k] != p:
                     continue
-                for dr in range(-near, near + 1):
-                    for j in range(k + dr * width - near, k + dr * width + near + 1):
-                        if patch[j] <= p:
-                            continue
-                        if patch[j] == UNKNOWN:
-                            open_[p] = True
-                            continue
-                        q = np.int64(patch[j])
-                        if votes[q, 0] == 0:
+                # Gathered first without a branch, then looked at: which cells those are is hard to foresee.
+                count = 0
+                for dr in range(-NEAR, NEAR + 1):
+                    begin = k + dr * width - NEAR
+                    if highest[begin] > p:
+                        for j in range(begin, begin + 2 * NEAR + 1):
+                            around[np.uintp(count)] = j
+                            count += patch[np.uintp(j)] > p
+                for m in range(count):
+                    j = around[m]
+                    q = np.int64(patch[j])
+                    if q == UNKNOWN:
+                        open_[p] = True
+                        continue
+                    if votes[q, ASKED] >> 1 != k:
+                        votes[q, ASKED] = 2 * k + (abs(residual(planes, squares, q, pos, k, cell)) < AGREE)
+                        if votes[q, PAIRS] == 0:
                             touched[n] = q
                             n += 1
-                        votes[q, 0] += 1
-                        if (
-                            abs(residual(planes, squares, p, pos, j, cell)) < agree
-                            and abs(residual(planes, squares, q, pos, k, cell)) < agree
-                        ):
-                            votes[q, 1] += 1
+                    if agrees[j] >> 1 != p:
+                        agrees[j] = 2 * p + (abs(residual(planes, squares, p, pos, j, cell)) < AGREE)
+                    votes[q, PAIRS] += 1
+                    votes[q, AGREEING] += votes[q, ASKED] & agrees[j] & 1
         for m in range(n):
             q = touched[m]
-            if 2 * votes[q, 1] >= votes[q, 0]:
+            if 2 * votes[q, AGREEING] >= votes[q, PAIRS]:
                 a, b = _root(parent, p), _root(parent, q)
                 parent[max(a, b)] = min(a, b)
-            votes[q, 0] = votes[q, 1] = 0
+            votes[q, PAIRS] = votes[q, AGREEING] = 0
     for p in range(len(parent)):
         parent[p] = _root(parent, p)
 

@@ -61,18 +61,20 @@ def index_references(width: Any, cell: Any, pos: Any, state: Any, index: Any) ->
     for row in range(len(state) // width):
         start = row * width
         gap = NONE
-        for k in range(start + width - 1, start - 1, -1):
+        for behind in range(width):
+            k = np.uintp(start + width - 1 - behind)
             gap = 0 if state[k] & REF else min(gap + 1, NONE)
             right[k] = gap
         gap = NONE
         total = 0
-        for k in range(start, start + width):
+        for col in range(width):
+            k = np.uintp(start + col)
             is_reference = (state[k] & REF) != 0
             gap = 0 if is_reference else min(gap + 1, NONE)
             left[k] = gap
             total += (state[k] & UNPROVEN) != 0
-            unproven[k] = total + (unproven[k - width] if row > 0 else 0)
-            place[k] = _packed(pos[k, 0] - (k - start) * cell, pos[k, 1] - row * cell) if is_reference else NOWHERE
+            unproven[k] = total + (unproven[np.uintp(start + col - width)] if row > 0 else 0)
+            place[k] = _packed(pos[k, 0] - col * cell, pos[k, 1] - row * cell) if is_reference else NOWHERE
 
 
 @leaf
