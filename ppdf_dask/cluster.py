@@ -29,6 +29,7 @@ ENVIRONMENT = {
     "MALLOC_ARENA_MAX": "1",
     "MALLOC_MMAP_THRESHOLD_": "8388608",
     "MALLOC_TRIM_THRESHOLD_": "33554432",
+    "DASK_DISTRIBUTED__WORKER__PROFILE__CYCLE": "10m",
 }
 """Environment of a worker.
 
@@ -36,6 +37,9 @@ Parallelism comes from processes alone, so threads must not multiply inside. Das
 give each array back at once and fetch its pages anew: a tenth of a run's processor time. With these it keeps up to
 32 MiB and what lies between arrays of less than 8 MiB, once per process: with an arena for each of a worker's threads,
 what one has freed is lost to the others.
+
+The profiler of the dashboard keeps a tree of calls for each cycle, up to a thousand of about 100 kB: with Dask's own
+cycle of a second a busy worker grows for a quarter of an hour.
 """
 
 ENCRYPTED = ("tls", "wss", "inproc")
@@ -80,6 +84,7 @@ def local_cluster(workers: int | None = None) -> Iterator[Client]:
     config = {
         "distributed.nanny.pre-spawn-environ": {**before, **ENVIRONMENT},
         "distributed.worker.daemon": True,
+        "distributed.worker.profile.cycle": ENVIRONMENT["DASK_DISTRIBUTED__WORKER__PROFILE__CYCLE"],
         # Dask gives up a worker's place for good when it is empty 15 seconds after a death, also when the next worker
         # died meanwhile or starts slowly on a busy machine: in the end nobody is left and the run waits for ever.
         "distributed.deploy.lost-worker-timeout": "365 days",

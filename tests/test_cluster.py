@@ -69,6 +69,9 @@ def test_what_we_start_listens_on_loopback_only_and_keeps_its_memory(monkeypatch
     monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "1000000")  # what the user sets goes before
     with cluster.local_cluster(1) as client:
         (found,) = client.run(lambda: dict(os.environ)).values()
+        (cycle,) = client.run(
+            lambda dask_worker: dask_worker.periodic_callbacks["profile-cycle"].callback_time
+        ).values()
         info = client.scheduler_info()
         addresses = [info["address"], *info["workers"], *(w["nanny"] for w in info["workers"].values())]
         ports = {int(a.rsplit(":", 1)[1]) for a in addresses} | set(info["services"].values())
@@ -77,6 +80,7 @@ def test_what_we_start_listens_on_loopback_only_and_keeps_its_memory(monkeypatch
     assert all("//127.0.0.1:" in a for a in addresses)
     assert {address for address, port in heard if port in ports} == {"0100007F"}
     assert ports <= {port for _, port in heard}
+    assert cycle == 600_000
     assert {name: found[name] for name in cluster.ENVIRONMENT} == {
         **cluster.ENVIRONMENT,
         "MALLOC_TRIM_THRESHOLD_": "1000000",
