@@ -1,6 +1,8 @@
-"""The search for the nearest references: every way of searching against all pairs."""
+"""The search for the nearest references: every way of searching against all pairs. Sums and orders beside it."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import oracle_robust
@@ -8,7 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ppdf_dask.filters.ppdf.robust.cells import LOW, REF
+from ppdf_dask.filters.cloud import cloud_from_xyz
+from ppdf_dask.filters.ppdf.robust.cells import LOW, REF, UNPROVEN
+from ppdf_dask.filters.ppdf.robust.classify import _by_rows
+from ppdf_dask.filters.ppdf.robust.growth import NOT_KNOWN
 from ppdf_dask.filters.ppdf.robust.lanes import (
     CELL,
     COUNT,
@@ -22,6 +27,7 @@ from ppdf_dask.filters.ppdf.robust.lanes import (
     room_for_lanes,
     surfaces,
 )
+from ppdf_dask.filters.ppdf.robust.roughness import local_roughness
 from ppdf_dask.filters.ppdf.robust.surface import add_reference, index_references, room_for_index
 
 WIDTH, INNER, RINGS, PLACES = 32, (11, 21), 8, 2 * LANES + 5
@@ -83,3 +89,41 @@ def test_a_reference_added_leaves_the_index_of_all(seed, share):
     index_references(WIDTH, 1_000, pos, state, expected)
     for got, wanted in zip(index, expected, strict=True):
         np.testing.assert_array_equal(got, wanted)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    shape=st.tuples(st.integers(1, 20), st.integers(1, 20)),
+    reach=st.integers(0, 6),
+    share=st.sampled_from([0.0, 0.02, 0.3]),
+)
+@settings(deadline=None, max_examples=60)
+def test_roughness_is_the_mean_depth_of_what_lies_below(seed, shape, reach, share):
+    """The oracle goes from cell to cell."""
+    rng = np.random.default_rng(seed)
+    residuals = rng.integers(-2_000, 1_000, shape).astype(np.int32)
+    residuals[rng.random(shape) < 0.3] = NOT_KNOWN
+    state = np.where(rng.random(shape) < share, UNPROVEN | LOW, LOW).astype(np.uint8)
+    expected = np.empty(shape, np.int32)
+    for row, col in np.ndindex(shape):
+        around = (slice(max(row - reach, 0), row + reach + 1), slice(max(col - reach, 0), col + reach + 1))
+        depths = [min(-r, 1_000) for r in residuals[around].ravel().tolist() if NOT_KNOWN < r < 0]
+        proven = not (state[around] & UNPROVEN).any()
+        expected[row, col] = (sum(depths) // max(len(depths), 1)) if proven else NOT_KNOWN
+    found = local_roughness(shape[1], state.ravel(), residuals.ravel(), reach, 1_000)
+    assert found.tolist() == expected.ravel().tolist()
+
+
+@given(
+    y=st.lists(st.integers(-40, 40) | st.integers(-1_000_000, 1_000_000), min_size=1, max_size=40),
+    core=st.integers(0, 40),
+    cell=st.sampled_from([1, 7, 1000]),
+)
+@settings(deadline=None)
+def test_points_are_put_in_rows_the_core_first(y, core, cell):
+    n_core = min(core, len(y))
+    cloud = cloud_from_xyz(np.array([[0.0, v / 1000, 0.0] for v in y]))
+    cloud = dataclasses.replace(cloud, n_core=n_core)
+    rows = (cloud.y.astype(np.int64) - int(cloud.y.min())) // cell
+    expected = sorted(range(n_core), key=lambda i: rows[i]) + sorted(range(n_core, len(y)), key=lambda i: rows[i])
+    assert _by_rows(cloud, cell).tolist() == expected

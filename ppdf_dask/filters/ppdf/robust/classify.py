@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ppdf_dask.filters.cloud import Cloud, Verdict
+from ppdf_dask.filters.ppdf.compiled import kernel
 from ppdf_dask.filters.ppdf.robust import cells as cells_
 from ppdf_dask.filters.ppdf.robust.cells import Cells
 from ppdf_dask.filters.ppdf.robust.fine import halve
@@ -81,11 +83,26 @@ def classify_area(cloud: Cloud, params: RobustParams) -> Verdict:
 
 def _by_rows(cloud: Cloud, cell: int) -> npt.NDArray[np.int64]:
     """Return an order of the points, core first, in which those of a row of cells follow each other."""
-    rows = (cloud.y - cloud.y.min()) // cell
-    if rows.max() < 1 << 16:  # sixteen bits are sorted in linear time
-        rows = rows.astype(np.uint16)
-    n = cloud.n_core
-    return np.concatenate([np.argsort(rows[:n], kind="stable"), n + np.argsort(rows[n:], kind="stable")])
+    n, lowest, highest = cloud.n_core, int(cloud.y.min()), int(cloud.y.max())
+    order, next_of_row = np.empty(cloud.n, np.int64), np.empty((highest - lowest) // cell + 2, np.int64)
+    _sort_into_rows(cloud.y[:n], 0, lowest, cell, next_of_row, order[:n])
+    _sort_into_rows(cloud.y[n:], n, lowest, cell, next_of_row, order[n:])
+    return order
+
+
+@kernel
+def _sort_into_rows(y: Any, first: Any, lowest: Any, cell: Any, next_of_row: Any, order: Any) -> None:
+    """Set `order` to the numbers of the points, from `first` on, row by row; room: `next_of_row`, one more than rows."""
+    for row in range(len(next_of_row)):
+        next_of_row[row] = 0
+    for i in range(len(y)):
+        next_of_row[np.uintp((y[i] - lowest) // cell + 1)] += 1
+    for row in range(1, len(next_of_row)):
+        next_of_row[row] += next_of_row[row - 1]
+    for i in range(len(y)):
+        here = np.uintp((y[i] - lowest) // cell)
+        order[np.uintp(next_of_row[here])] = first + i
+        next_of_row[here] += 1
 
 
 def _classify_in_order(cloud: Cloud, params: RobustParams) -> Verdict:

@@ -44,13 +44,15 @@ def cliff_tops(width: int, pos: npt.NDArray[np.int32], state: npt.NDArray[np.uin
 @kernel
 def _find_tops(width: Any, pos: Any, state: Any, spans: Any, tops: Any) -> None:
     wide = width // BLOCK
-    for k in range(len(state)):
-        s = state[k]
-        if s & (REF | UNPROVEN):
-            b = k // width // BLOCK * wide + k % width // BLOCK
-            spans[b, 0] = min(spans[b, 0], pos[k, 2] if s & LOW else NO_CLIFF)
-            spans[b, 1] = max(spans[b, 1], pos[k, 2] if s & LOW else NOWHERE)
-            spans[b, 2] |= s & UNPROVEN
+    for row in range(len(state) // width):
+        for col in range(width):
+            k = np.uintp(row * width + col)
+            s = state[k]
+            if s & (REF | UNPROVEN):
+                here = np.uintp(row // BLOCK * wide + col // BLOCK)
+                spans[here, 0] = min(spans[here, 0], pos[k, 2] if s & LOW else NO_CLIFF)
+                spans[here, 1] = max(spans[here, 1], pos[k, 2] if s & LOW else NOWHERE)
+                spans[here, 2] |= s & UNPROVEN
     for b in range(wide + 1, len(spans) - wide - 1):
         bottom, top = np.int64(NOWHERE), np.int64(NO_CLIFF)
         for start in range(b - wide - 1, b + wide, wide):

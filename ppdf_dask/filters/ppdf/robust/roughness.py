@@ -5,9 +5,12 @@ Only the references below the surface are counted: vegetation mistaken for groun
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
+from ppdf_dask.filters.ppdf.compiled import kernel, leaf
 from ppdf_dask.filters.ppdf.robust.cells import UNPROVEN
 from ppdf_dask.filters.ppdf.robust.growth import NOT_KNOWN
 
@@ -20,21 +23,60 @@ def local_roughness(
     NOT_KNOWN where an unproven cell lies within; 0 where there is no negative residual. Sums of integers: exact,
     whatever the order.
     """
-    below = (residuals < 0) & (residuals != NOT_KNOWN)
-    depth = np.where(below, np.minimum(-residuals, most), 0)
-    sums = _around(depth.reshape(-1, width), reach)
-    # Both counts in one number: there are fewer than 65 536 cells around.
-    counts = _around((below + ((state & UNPROVEN != 0).astype(np.int32) << 16)).reshape(-1, width), reach)
-    rough: npt.NDArray[np.int32] = sums // np.maximum(counts & 65_535, 1)
-    rough[counts >> 16 != 0] = NOT_KNOWN
-    return rough.reshape(-1)
+    rough, across, column = (
+        np.empty(len(state), np.int32),
+        np.empty((2, len(state)), np.int32),
+        np.empty((2, width), np.int32),
+    )
+    _take_means(width, state, residuals, reach, most, across, column, rough)
+    return rough
 
 
-def _around(values: npt.NDArray[np.int32], reach: int) -> npt.NDArray[np.int32]:
-    """Return the sum over the cells up to `reach` away in each direction."""
-    for _ in range(2):
-        sums = np.zeros((values.shape[0] + 2 * reach + 1, values.shape[1]), np.int32)
-        np.cumsum(values, axis=0, out=sums[reach + 1 : -reach])
-        sums[-reach:] = sums[-reach - 1]
-        values = (sums[2 * reach + 1 :] - sums[: -2 * reach - 1]).T
-    return values
+@kernel
+def _take_means(
+    width: Any, state: Any, residuals: Any, reach: Any, most: Any, across: Any, column: Any, rough: Any
+) -> None:
+    """Slide a sum along each row into `across`, and a sum of these along the columns.
+
+    Beside the depths go two counts in one number, as there are fewer than 65 536 cells around: of the residuals, and of
+    the unproven cells above them.
+    """
+    height = len(state) // width
+    for row in range(height):
+        depth = count = np.int32(0)
+        for col in range(-reach, width):
+            if col + reach < width:
+                k = np.uintp(row * width + col + reach)
+                depth += _depth(residuals[k], most)
+                count += _count(residuals[k], state[k])
+            if col > reach:
+                k = np.uintp(row * width + col - reach - 1)
+                depth -= _depth(residuals[k], most)
+                count -= _count(residuals[k], state[k])
+            if col >= 0:
+                across[0, row * width + col], across[1, row * width + col] = depth, count
+    for col in range(width):
+        column[0, col] = column[1, col] = 0
+    for row in range(-reach, height):
+        if row + reach < height:
+            for col in range(width):
+                column[0, col] += across[0, (row + reach) * width + col]
+                column[1, col] += across[1, (row + reach) * width + col]
+        if row > reach:
+            for col in range(width):
+                column[0, col] -= across[0, (row - reach - 1) * width + col]
+                column[1, col] -= across[1, (row - reach - 1) * width + col]
+        if row >= 0:
+            for col in range(width):
+                mean = column[0, col] // max(column[1, col] & 65_535, 1)
+                rough[row * width + col] = NOT_KNOWN if column[1, col] >> 16 else mean
+
+
+@leaf
+def _depth(residual: Any, most: Any) -> Any:
+    return np.int32(min(-residual, most) if NOT_KNOWN < residual < 0 else 0)
+
+
+@leaf
+def _count(residual: Any, state: Any) -> Any:
+    return np.int32(NOT_KNOWN < residual < 0) + (np.int32((state & UNPROVEN) != 0) << 16)
