@@ -92,7 +92,7 @@ def _by_rows(cloud: Cloud, cell: int) -> npt.NDArray[np.int64]:
 
 @kernel
 def _sort_into_rows(y: Any, first: Any, lowest: Any, cell: Any, next_of_row: Any, order: Any) -> None:
-    """Set `order` to the numbers of the points, from `first` on, row by row; room: `next_of_row`, one more than rows."""
+    """Set `order` to the numbers of the points from `first` on, row by row; room: `next_of_row`, one more than rows."""
     for row in range(len(next_of_row)):
         next_of_row[row] = 0
     for i in range(len(y)):
