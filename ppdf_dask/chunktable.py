@@ -58,7 +58,7 @@ class ChunkTable(Mapping[str, int]):
     ----------
     places : ndarray of int64, shape (n,)
         Where the chunks are, ascending (see `places`).
-    values : ndarray of int64, shape (n,)
+    counts : ndarray of int64, shape (n,)
         Their numbers.
 
     Examples
@@ -68,8 +68,8 @@ class ChunkTable(Mapping[str, int]):
     ({'c_0000_0001': 10, 'c_0007_m0002': 20}, 20, False)
     """
 
-    def __init__(self, places: Int64, values: Int64) -> None:
-        self.places, self.counts = places, values
+    def __init__(self, places: Int64, counts: Int64) -> None:
+        self.places, self.counts = places, counts
 
     def row(self, chunk: str) -> int:
         """Return the position of a chunk; raises KeyError when there is none."""

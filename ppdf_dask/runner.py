@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -33,7 +33,7 @@ from ppdf_dask.raster import create
 from ppdf_dask.repair import heal, sweep, take_notes
 from ppdf_dask.repeats import shared_problems
 from ppdf_dask.saved import save_plan
-from ppdf_dask.stages import ChunkFacts, Cutting, Inputs, Kept, Records, Total, Waiting, brief
+from ppdf_dask.stages import ChunkFacts, Cutting, Inputs, Kept, Records, Total, Waiting, Works, brief
 from ppdf_dask.store import RunStore
 from ppdf_dask.tiles import Problem, problem_dict, shown
 
@@ -220,7 +220,7 @@ class _Run:
         self,
         name: StageName,
         function: Any,
-        works: Collection[Work],
+        works: list[Work] | Works,
         records: Kept,
         still_good: Callable[[str, dict[str, Any]], bool] = lambda ident, record: True,
     ) -> Kept:

@@ -7,7 +7,7 @@ Pure bookkeeping over the plan and the ledger's records: nothing here runs anyth
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import chain
@@ -100,7 +100,7 @@ class Waiting:
     because: str
 
 
-class Works(Collection[Work]):
+class Works:
     """Pieces of work that are made whenever they are looked at, for the stage that has a piece for each chunk.
 
     Parameters
@@ -119,9 +119,6 @@ class Works(Collection[Work]):
 
     def __len__(self) -> int:
         return len(self._items)
-
-    def __contains__(self, work: object) -> bool:
-        return any(work == other for other in self)
 
 
 @dataclass(frozen=True)
