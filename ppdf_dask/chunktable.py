@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,16 +12,17 @@ from ppdf_dask.errors import ParameterError
 from ppdf_dask.grid import chunk_id, parse_id
 
 Int64 = npt.NDArray[np.int64]
+Numbers = TypeVar("Numbers", int, Int64)
 
 _ROWS = 1 << 32
 
 
-def places(ix: Int64, iy: Int64) -> Int64:
+def places(ix: Numbers, iy: Numbers) -> Numbers:
     """Return a number for each chunk, in the order of column and row.
 
     Parameters
     ----------
-    ix, iy : ndarray of int64
+    ix, iy : int or ndarray of int64
         Columns and rows, below 2**31 in size: a chunk has 5 m at least, and coordinates are 64-bit millimetres of
         places on the earth.
     """
@@ -29,12 +30,11 @@ def places(ix: Int64, iy: Int64) -> Int64:
 
 
 def place(chunk: str) -> int:
-    """Return the number of one chunk."""
-    ix, iy = parse_id(chunk)
-    return ix * _ROWS + iy + _ROWS // 2
+    """Return the number of the chunk with this id."""
+    return places(*parse_id(chunk))
 
 
-def columns_and_rows(numbers: Int64) -> tuple[Int64, Int64]:
+def columns_and_rows(numbers: Numbers) -> tuple[Numbers, Numbers]:
     """Return what `places` was given.
 
     Examples
@@ -47,8 +47,7 @@ def columns_and_rows(numbers: Int64) -> tuple[Int64, Int64]:
 
 def chunk_at(number: int) -> str:
     """Return the id of the chunk with this number."""
-    ix, iy = divmod(number, _ROWS)
-    return chunk_id(ix, iy - _ROWS // 2)
+    return chunk_id(*columns_and_rows(number))
 
 
 class ChunkTable(Mapping[str, int]):

@@ -38,8 +38,8 @@ give each array back at once and fetch its pages anew: a tenth of a run's proces
 32 MiB and what lies between arrays of less than 8 MiB, once per process: with an arena for each of a worker's threads,
 what one has freed is lost to the others.
 
-The profiler of the dashboard keeps a tree of calls for each cycle, up to a thousand of about 100 kB: with Dask's own
-cycle of a second a busy worker grows for a quarter of an hour.
+The profiler of the dashboard keeps a tree of calls for each cycle, up to a thousand of them: with Dask's own cycle of a
+second a busy worker grows for a quarter of an hour.
 """
 
 ENCRYPTED = ("tls", "wss", "inproc")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +42,7 @@ class ChunkEstimate:
         return self.grid.chunk(self.ix, self.iy).core
 
 
-class ChunkEstimates(Sequence[ChunkEstimate]):
+class ChunkEstimates:
     """The chunks of a plan, 24 bytes each.
 
     Attributes
@@ -55,15 +54,9 @@ class ChunkEstimates(Sequence[ChunkEstimate]):
     def __init__(self, grid: ChunkGrid, places: Int64, points: Float, loaded: Float) -> None:
         self._grid, self._places, self.points, self.loaded = grid, places, points, loaded
 
-    @overload
-    def __getitem__(self, k: int) -> ChunkEstimate: ...
-    @overload
-    def __getitem__(self, k: slice) -> ChunkEstimates: ...
-    def __getitem__(self, k: int | slice) -> ChunkEstimate | ChunkEstimates:
-        if isinstance(k, slice):
-            return ChunkEstimates(self._grid, self._places[k], self.points[k], self.loaded[k])
-        ix, iy = columns_and_rows(self._places[k])
-        return ChunkEstimate(self._grid, int(ix), int(iy), float(self.points[k]), float(self.loaded[k]))
+    def __iter__(self) -> Iterator[ChunkEstimate]:
+        for ix, iy, n, loaded in zip(*columns_and_rows(self._places), self.points, self.loaded, strict=True):
+            yield ChunkEstimate(self._grid, int(ix), int(iy), float(n), float(loaded))
 
     def __len__(self) -> int:
         return len(self._places)

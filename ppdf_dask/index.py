@@ -148,6 +148,7 @@ class Index:
     def _paths(self) -> set[str]:
         return {index_path(chunk) for chunk in self.loaded}
 
+    @cached_property
     def _key(self) -> dict[str, str]:
         return {"digest": digest([self.sources, hashlib.sha256(self.rows.tobytes()).hexdigest()])}
 
@@ -164,11 +165,11 @@ class Index:
                 store.drop(path)
         for path in list(self.orphans(store)):
             store.drop(path)
-        store.put_record("index", "key", self._key())
+        store.put_record("index", "key", self._key)
 
     def is_published(self, store: RunStore) -> bool:
         """Tell whether this index, and no older one, was written to its end."""
-        return store.get_record("index", "key") == self._key()
+        return store.get_record("index", "key") == self._key
 
     def orphans(self, store: RunStore) -> Iterator[str]:
         """Yield the paths of fragments that no finished tile claims, and of results of chunks that are no more."""
